@@ -390,11 +390,8 @@ def _capture_record(capture: AnyCapture, source: Capture) -> dict[str, Any]:
 
 def _is_continuous(frames: Sequence[StreamedFrame]) -> bool:
     """Whether successive frames of a capture mostly show hands that hardly changed."""
-    pairs = [
-        (one.points, other.points)
-        for one, other in pairwise(frames)
-        if min(len(one.points), len(other.points)) >= FEWEST_MARKERS
-    ]
+    clouds = [(one.points, other.points) for one, other in pairwise(frames)]
+    pairs = [pair for pair in clouds if min(map(len, pair)) >= FEWEST_MARKERS]
     chosen = np.unique(np.linspace(0, len(pairs) - 1, min(_COMPARED_PAIRS, len(pairs))).astype(int))
     changes = [change_of_distances(*pairs[number]) for number in chosen]
     return bool(changes and np.mean([change < _MOST_CHANGE for change in changes]) >= _LEAST_CONTINUOUS_SHARE)

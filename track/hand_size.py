@@ -26,7 +26,6 @@ from handsim.arrays import Doubles
 from handsim.errors import ArgumentError, HandSimError, HandSimWarning
 from handsim.hand.model import HandModel
 from handsim.hand.shape import ADULT_LENGTH, DIGITS, SIZES, HandShape, Side
-from handsim.space.transforms import MIRROR
 from track.association.hand_state import HandState
 from track.association.initialization import HandInitializer, distances_to_nearest
 from track.calibration.energy import (
@@ -40,7 +39,7 @@ from track.calibration.energy import (
     shared_covariance,
     user_hand,
 )
-from track.calibration.hand_parameters import LENGTH, NUM_PARAMETERS
+from track.calibration.hand_parameters import LENGTH, NUM_PARAMETERS, mirror_to_right
 from track.config import TrackerConfig
 from track.frames import StreamedFrame, TrackedHand
 from track.kinematics.pose_solver import FEWEST_MARKERS, PoseSolver
@@ -60,8 +59,8 @@ _MARKER_SPREAD: Final = 0.002  # [m] standard deviation of glued markers per axi
 _INDEPENDENT_FRAMES: Final = 4.0  # All frames count as this many, because errors of glue and flesh repeat.
 _SEARCH_FRAMES: Final = 8  # frames of each hand in the search of length and breadth
 _PROPORTION_FRAMES: Final = 40  # frames of each hand in the fit of proportions
-_FOUND_SHARE: Final = 0.5  # A measured size is kept if its hands are found in this share of the frames,
-# or in this share if they fit well, because touching hands are seldom initialized.
+_FOUND_SHARE: Final = 0.5  # A measured size is kept if its hands are found in this share of the frames.
+# A size whose hands fit well needs this share only, because touching hands are seldom initialized.
 _LEAST_WELL_FITTED_SHARE: Final = 0.1
 # [m] largest median RMS distance of hands that fit well; false hands exceed it
 _WELL_FITTED_RMS: Final = 0.00175
@@ -77,8 +76,8 @@ _USUAL_CONFIG: Final = TrackerConfig()
 _LENIENT_CONFIG: Final = TrackerConfig(least_evidence=2.0)
 _FIT_STEPS, _FEW_STEPS = 15, 2  # steps to fit proportions, and to follow a slip from a tracked hand
 _LEAST_PRECISION: Final = 1.0  # [1/m^2] lower bound of a shift's precision; avoids a division by zero
-_COMPARED_PART: Final = 30  # Hands are compared in two parts of this many frames,
-_FEWEST_COMPARED: Final = 10  # and not at all in fewer frames than this.
+_COMPARED_PART: Final = 30  # Hands are compared in two parts of this many frames.
+_FEWEST_COMPARED: Final = 10  # Hands are compared in at least this many frames.
 AT_HAND: Final = 0.04
 """Distance from a hand's markers within which a point counts as its own [m]."""
 _UNEXPLAINED_PENALTY: Final = 3.0  # log-odds lost per unlabeled point at a hand, and per missing marker
@@ -88,8 +87,8 @@ _MOST_HIDDEN: Final = 0.35  # missing markers of a good fit, per marker, if ever
 _FEW_NEAR_POINTS: Final = 2.5  # number of nearby points that may be ghosts
 _MOST_RMS: Final = 0.004  # [m] median RMS distance of a good fit
 _SUGGESTED_SHARE: Final = 0.5  # Suggested hands must be found in this share of the frames.
-_GLOVE_RATIO: Final = 1.15  # Another glove is suggested if its log-odds are this many times ours,
-_SCALE_RATIO: Final = 2.0  # another scale if they are this many times ours.
+_GLOVE_RATIO: Final = 1.15  # Another glove is suggested if its log-odds are this many times ours.
+_SCALE_RATIO: Final = 2.0  # Another scale is suggested if its log-odds are this many times ours.
 _UNITS: Final = {"millimeters": 1e-3, "centimeters": 1e-2, "meters": 1.0, "inches": 0.0254, "feet": 0.3048}
 _STATED_UNITS: Final = ("millimeters", "centimeters", "meters")  # units that files can state
 _WAND_SCALES: Final = (2.0, 0.5)  # scales if the calibration wand's length was entered wrongly
@@ -253,11 +252,8 @@ def _labeled_markers(
         for seen, some in zip(tracker.step(frame.points, frame.ids, frame.time).hands, found, strict=True):
             if _is_shown(seen, count):
                 some.append(seen.seen_markers)
-    return [
-        spread_out(np.array(some), _PROPORTION_FRAMES) @ (MIRROR if side == "left" else np.eye(3))
-        for side, some in zip(sides, found, strict=True)
-        if len(some) >= _FEWEST_FRAMES
-    ]
+    shown = [(side, some) for side, some in zip(sides, found, strict=True) if len(some) >= _FEWEST_FRAMES]
+    return [spread_out(np.array(some), _PROPORTION_FRAMES) @ mirror_to_right(side) for side, some in shown]
 
 
 class _Search:
@@ -327,7 +323,7 @@ def glove_shifts(
         worn: The hand as tracked.
     """
     right = worn.with_side("right")
-    problem, estimate = _first_proportions(seen @ (MIRROR if worn.side == "left" else np.eye(3)), right)
+    problem, estimate = _first_proportions(seen @ mirror_to_right(worn.side), right)
     estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FEW_STEPS, None, QUICK_GAIN)
     _, by_shared, residuals, _ = jacobians = problem.weighted_jacobians(estimate, fit)
     equations = problem.normal_equations(estimate, fit, jacobians)

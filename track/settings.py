@@ -30,7 +30,6 @@ USUAL_SIZE: Final = "M"
 """Size of hands that could not be measured."""
 _ANY_HANDS: Final = "a User, GloveFits, the path of a user's file, or sides"
 # A frame is used to measure hands if it has points for this share of a hand's markers.
-_LEAST_POINT_SHARE: Final = 0.8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,11 +129,6 @@ class TrackerSetup:
         return cls(user, is_auto, labeler, bodies, config, record)
 
     @property
-    def fewest_points(self) -> float:
-        """Number of points of a frame from which hands can be measured."""
-        return _LEAST_POINT_SHARE * self.user.layout.num_markers
-
-    @property
     def start(self) -> tuple[GloveFit, ...]:
         """The hands that a calibration begins with: measured ones are replaced by hands of mean proportions.
 
@@ -181,9 +175,7 @@ def _chosen_user(settings: LabelSettings) -> tuple[User, bool]:
         if layout is not None and user.layout.names != layout.names:
             name = settings.glove if isinstance(settings.glove, str | Path) else layout.name
             worn, asked = (", ".join(one.names) for one in (user.layout, layout))
-            raise ArgumentError(
-                f"the hands wear a glove with the markers {worn}, but glove '{name}' has {asked}"
-            )
+            raise ArgumentError(f"the hands' glove has the markers {worn}, but glove '{name}' has {asked}")
         return user, False
     glove, is_auto = layout or load_layout(USUAL_GLOVE), settings.size == "auto"
     return nominal_user(glove, USUAL_SIZE if is_auto else settings.size, hands), is_auto  # type: ignore[arg-type]

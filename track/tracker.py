@@ -47,8 +47,8 @@ _DOUBT_RMS: Final = 0.003  # [m] A track with a larger RMS distance, biases remo
 _DOUBT_RADIUS: Final = 0.2  # [m] distance from the wrist within which unlabeled points confirm the doubt
 _REPLACEMENT_MARGIN: Final = 20.0  # log-odds by which a new pose must be better than a doubted track
 _FIRST_WAIT: Final = 0.005  # [s] to the next attempt after a failed initialization; less than a frame
-_WAIT_FACTOR: Final = 1.5  # factor of that time after each failed attempt
-_LONGEST_WAIT: Final = 0.1  # [s] longest such time
+_WAIT_FACTOR: Final = 1.5  # factor of the wait after each failed attempt
+_LONGEST_WAIT: Final = 0.1  # [s] longest wait between attempts
 _MORE_POINTS: Final = 3  # With this many more points the next attempt is made at once.
 _HAND_SPACING: Final = 0.5  # [m] between the hands in the warm-up
 _UNSURE_EXTENT: Final = 0.12  # [m] size of random clouds, whose labels need verification
@@ -98,12 +98,8 @@ class Tracker:
         self.labeler = labeler_of(self.user.layout, labeler)
         self._intake = FrameValidator(config.silence)
         self._bodies = [BodyTracker(body) for body in self.bodies]
-        self._states = [
-            HandState(
-                hand, config, origin=self.user.origin(hand.side), errors=self.user.errors.get(hand.side)
-            )
-            for hand in self.hands
-        ]
+        known = [(hand, self.user.origin(hand.side), self.user.errors.get(hand.side)) for hand in self.hands]
+        self._states = [HandState(one, config, origin=origin, errors=errors) for one, origin, errors in known]
         counts = [*(one.num_markers for one in self._states), *(len(one.marker_names) for one in self.bodies)]
         self._numbering = Numbering(counts)
         self._history = PointHistory(self._numbering, config.silence)
@@ -182,17 +178,13 @@ class Tracker:
         started, outcomes = self._initialize_lost(updated, outcomes)
         final, outcomes = self._replace_doubted(started, outcomes)
         self._history.keep(final)
-        hands = tuple(
-            _tracked_hand(state, outcome, final, final.markers(hand))
-            for hand, (state, outcome) in enumerate(zip(self._states, outcomes, strict=True))
-        )
+        pairs = enumerate(zip(self._states, outcomes, strict=True))
+        hands = tuple(_tracked_hand(state, one, final, final.markers(hand)) for hand, (state, one) in pairs)
         all_labels, all_confidence = np.full(incoming.num_points, -1), np.ones(incoming.num_points)
         all_labels[incoming.kept] = labels
         all_labels[incoming.kept[free]], all_confidence[incoming.kept[free]] = final.labels, final.confidence
-        seconds = perf_counter() - began
-        return TrackedFrame(
-            float(incoming.stamp), hands, all_labels, all_confidence, bodies, incoming.notes, seconds
-        )
+        took = perf_counter() - began
+        return TrackedFrame(incoming.stamp, hands, all_labels, all_confidence, bodies, incoming.notes, took)
 
     def _track_bodies(self, incoming: IncomingFrame) -> tuple[tuple[TrackedBody, ...], Integers]:
         """Track every body; return also the labels (P,) of their points."""

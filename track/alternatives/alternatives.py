@@ -30,6 +30,7 @@ from track.alternatives.placement import (
     place_markers,
 )
 from track.calibration.energy import QUICK_OPTIONS
+from track.calibration.hand_parameters import mirror_to_right
 from track.kinematics.pose_solver import PoseSolver
 from track.user import hand_like
 from train.labelers.matching import assign
@@ -139,13 +140,10 @@ def judge_take(take: Take) -> tuple[JudgedHand, ...]:
 
 def with_doubt(take: Take, judged: Sequence[JudgedHand]) -> Take:
     """The take with its alternatives in its settings, and its confidences lowered by them."""
-    record = {
-        one.side: {
-            "tried": [alternative._asdict() for alternative in one.alternatives],
-            "distances": np.linalg.norm(one.offsets, axis=1).round(5).tolist(),
-        }
-        for one in judged
-    }
+    record = {}
+    for one in judged:
+        distances = np.linalg.norm(one.offsets, axis=1).round(5).tolist()
+        record[one.side] = {"tried": [each._asdict() for each in one.alternatives], "distances": distances}
     take = dataclasses.replace(take, settings={**take.settings, ALTERNATIVES: record})
     points, right = take.point_list, np.append(label_probability(take), 1.0)
     confidence = points.confidence * right[np.minimum(points.labels, len(right) - 1)]
@@ -284,7 +282,7 @@ def _mirror_orders(points: Float[np.ndarray, "M 3"]) -> Iterator[list[int]]:
 
 def _columns_of(take: Take, side: Side) -> Columns | None:
     """The points of a hand in frames spread over the take; None if too few frames show enough markers."""
-    number, mirror = take.hand_index(side), MIRROR if side == "left" else np.eye(3)
+    number, mirror = take.hand_index(side), mirror_to_right(side)
     part, worn = take.hand_labels[number], take.hands[number]
     there = np.isfinite(take.observed(part)[..., 0])
     counts = there.sum(axis=1)
@@ -304,10 +302,8 @@ def _columns_of(take: Take, side: Side) -> Columns | None:
     return Columns(worn.layout.names, np.concatenate([seen, *strays], axis=1) @ mirror, hand_like(worn))
 
 
-def _steady_points(
-    take: Take, worn: GloveFit, frames: Integers, seen: Doubles
-) -> Iterator[Float[np.ndarray, "F 3"]]:
-    """Yield unlabeled points that move with the palm or a digit while that digit lacks a marker."""
+def _steady_points(take: Take, worn: GloveFit, frames: Integers, seen: Doubles) -> Iterator[Doubles]:
+    """Yield unlabeled points (F, 3) that move with the palm or a digit while that digit lacks a marker."""
     missing = np.isnan(seen[..., 0])
     if missing.mean(axis=0).max() <= _MISSING_SHARE:
         return
@@ -415,10 +411,8 @@ def _shifted_orders(columns: Columns, now: Order) -> Iterator[tuple[Order, str, 
             changes = {a: now[b] for a, b in zip([*first, *second], [*second, *first], strict=True)}
             orders.append((_changed(now, changes), f"{DIGITS[one]} and {DIGITS[other]} are exchanged"))
     solver = PoseSolver(columns.worn)
-    rough = [
-        _rough_cost(solver, columns.of(order)) + columns.left_over(order)
-        for order in [now, *(one for one, _ in orders)]
-    ]
+    tried = [now, *(order for order, _ in orders)]
+    rough = [_rough_cost(solver, columns.of(order)) + columns.left_over(order) for order in tried]
     for (order, words), cost in zip(orders, rough[1:], strict=True):
         yield order, words, cost - rough[0]
 

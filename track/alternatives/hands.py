@@ -17,9 +17,9 @@ from gloves.captures.capture import runs_of
 from gloves.takes.points import spread_out
 from gloves.takes.take import Take
 from handsim.hand.shape import ADULT_LENGTH, Side
-from handsim.space.transforms import MIRROR
 from track.alternatives.placement import COMPLETE_SHARE, NUM_COMPARED, are_complete, place_markers
 from track.association.initialization import label_alone
+from track.calibration.hand_parameters import mirror_to_right
 from track.config import HandOrigin
 from track.kinematics.pose_solver import PoseSolver
 from track.user import hand_like, size_words
@@ -88,7 +88,7 @@ def _labeled(take: Take, side: Side, frames: Int[np.ndarray, "F"], most: int) ->
     """Markers of a hand, as a right one, in some of these frames [m]."""
     labels = take.hand_labels[take.hand_index(side)]
     seen = take.point_list.labeled(labels, spread_out(frames, most))
-    return np.asarray(seen @ (MIRROR if side == "left" else np.eye(3)))
+    return np.asarray(seen @ mirror_to_right(side))
 
 
 def _other_person(

@@ -16,6 +16,7 @@ from gloves.fit import GloveFit
 from handsim.arrays import Doubles, Flags
 from handsim.hand.model import HandModel
 from track.calibration.energy import (
+    COARSE_RELINEARIZE,
     QUICK_GAIN,
     QUICK_OPTIONS,
     Estimate,
@@ -31,7 +32,6 @@ NUM_COMPARED: Final = 10
 """Number of compared frames of a hand, whose errors are about independent."""
 COMPLETE_SHARE: Final = 0.75
 """A compared frame shows this share of the usual number of markers."""
-_RELINEARIZE: Final = 0.2  # A smaller value changes no probability by more than 0.01.
 _HEIGHT_SPREAD: Final = 0.0015  # [m] standard deviation of a marker's height above the layout's
 _OFFSET_SCALE: Final = 0.0035  # [m] scale of a marker's offset from the layout along the skin
 _FREEDOM: Final = 2.0  # degrees of freedom of the t-distribution of offsets
@@ -76,7 +76,7 @@ def place_markers(seen: Float[np.ndarray, "F M 3"], start: GloveFit, left_open: 
         start: A right hand in the glove as designed, of about the right size; or the hand of a person.
         left_open: Standard deviations of the hand's shape around that of `start`, as a share of people's.
     """
-    options = {**QUICK_OPTIONS, "relinearize": _RELINEARIZE}
+    options = {**QUICK_OPTIONS, "relinearize": COARSE_RELINEARIZE}
     problem, estimate = first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **options)
     problem.position_spread, problem.height_spread = _OFFSET_SCALE, _HEIGHT_SPREAD
     problem.precision = problem.precision / left_open**2
@@ -86,11 +86,10 @@ def place_markers(seen: Float[np.ndarray, "F M 3"], start: GloveFit, left_open: 
 def place_again(seen: Float[np.ndarray, "F M 3"], base: Placement) -> Placement:
     """Fit the same hand with other labels of the same points, starting from its shape."""
     shape = shape_at(base.problem.shape, base.estimate.parameters)
-    designed = attachment_at(base.start.layout, base.problem.design, shape)
+    start, design = base.estimate, base.problem.design
+    designed = attachment_at(base.start.layout, design, shape)
     qpos = PoseSolver(GloveFit(HandModel(shape), designed)).solve(seen).qpos
-    estimate = dataclasses.replace(
-        base.estimate, points=designed.points, coordinates=base.problem.design, qpos=qpos
-    )
+    estimate = dataclasses.replace(start, points=designed.points, coordinates=design, qpos=qpos)
     return _placed(base.problem.with_targets(seen), base.start, estimate)
 
 

@@ -18,12 +18,13 @@ from handsim.space.transforms import rigid_fit
 from train.labelers.matching import assign
 
 _LASTING_SHARE: Final = 0.5  # Use the stream's IDs only if this share of the last frame's IDs persists.
-# [m] gates of distances from the prediction, before hands are aligned and after each alignment
-_DISTANCES: Final = (0.04, 0.025, 0.015)
+# [m] Gates of distances from the prediction: before hands are aligned, and after each alignment.
+_LINK_GATES: Final = (0.04, 0.025, 0.015)
 _FEWEST_ALIGNED: Final = 5  # A hand is aligned with at least this many points.
-_NEIGHBORS: Final = 0.06  # [m] Distances between markers closer than this hardly change between frames.
-_FEWEST_NEIGHBORS: Final = 3  # A pair of frames needs this many neighbor pairs before their distances count.
-_SAME_PLACE: Final = 0.01  # [m] A point without a label that moves farther in a frame may be another one.
+# [m] Distances between markers closer than this hardly change between frames.
+_NEIGHBOR_DISTANCE: Final = 0.06
+_FEWEST_NEIGHBORS: Final = 3  # Two frames are compared if they share this many pairs of neighbors.
+_MOST_FREE_MOTION: Final = 0.01  # [m] An unlabeled point that moves farther in a frame may be another point.
 _BESIDE_DISTANCE: Final = 0.06  # [m] An unlabeled point this close to a hand's points moves with the hand.
 
 
@@ -165,7 +166,7 @@ class PointHistory:
         rows = [row for row, number in enumerate(known) if number in self._free]
         if rows:  # IDs may have been exchanged.
             since, places = zip(*(self._free[known[row]] for row in rows), strict=True)
-            near = ((points[rows] - np.array(places)) ** 2).sum(axis=1) < _SAME_PLACE**2
+            near = ((points[rows] - np.array(places)) ** 2).sum(axis=1) < _MOST_FREE_MOTION**2
             free_since[rows] = np.where(near, since, time)
         return FrameState(
             points, numbers, labels, evidence, confidence, first_seen, free_since, time, self._numbering
@@ -223,7 +224,7 @@ class PointLinker:
                 hands[row], predicted[row] = self._owners[label], expected[label]
         beside = self._beside(hands)
         moved, found = predicted.copy(), np.full(len(points), -1)
-        for distance in _DISTANCES:
+        for distance in _LINK_GATES:
             rows, columns = _assign(points, moved, distance)
             for hand in np.unique(hands[hands >= 0]):
                 own = hands[columns] == hand
@@ -236,7 +237,7 @@ class PointLinker:
         return found
 
     def _beside(self, hands: Integers) -> Int[np.ndarray, "Q"]:
-        """The hand that each unlabeled point of the last frame is near, and moves with; -1 for none."""
+        """The hand that each unlabeled point of the last frame is near and moves with; -1 for none."""
         beside, loose, held = np.full(len(hands), -1), np.flatnonzero(hands < 0), np.flatnonzero(hands >= 0)
         if len(loose) and len(held):
             distances = np.linalg.norm(self._points[loose, None] - self._points[held], axis=-1)
@@ -256,11 +257,11 @@ def _assign(points: Doubles, predicted: Doubles, distance: float) -> tuple[Integ
 def change_of_distances(before: Float[np.ndarray, "O 3"], points: Float[np.ndarray, "P 3"]) -> float:
     """Median change of the distances between neighbors [m]; infinite if too few points can be matched."""
     # About 2 mm between successive frames, even of fast hands; 8 mm and more between unrelated poses.
-    rows, columns = _assign(points, before, _DISTANCES[0])
+    rows, columns = _assign(points, before, _LINK_GATES[0])
     first, second = np.triu_indices(len(rows), 1)
     was = np.linalg.norm(before[columns[first]] - before[columns[second]], axis=-1)
     now = np.linalg.norm(points[rows[first]] - points[rows[second]], axis=-1)
-    near = was < _NEIGHBORS
+    near = was < _NEIGHBOR_DISTANCE
     return float(np.median(np.abs(now - was)[near])) if near.sum() >= _FEWEST_NEIGHBORS else np.inf
 
 
@@ -274,10 +275,8 @@ def match_log_odds(
     innovation = points[:, None] - positions
     precision = np.linalg.inv(covariances)
     square = np.einsum("pki,kij,pkj->pk", innovation, precision, innovation)
-    log_odds: np.ndarray = (
-        0.5 * np.log(np.linalg.det(precision)) - 0.5 * square - _stray_log_density(stray_density)
-    )
-    return log_odds
+    log_odds: Doubles = 0.5 * np.log(np.linalg.det(precision)) - 0.5 * square
+    return log_odds - _stray_log_density(stray_density)
 
 
 def peak_log_odds(variances: Float[np.ndarray, "K"], stray_density: float) -> Float[np.ndarray, "K"]:

@@ -1,8 +1,8 @@
 """The filter state of one hand: pose, velocity, covariances, and the learned bias of each marker.
 
-If the model differs from the user's hand, each marker is off by the same few millimeters in every frame, in
-the frame of its bone. Once this bias is known, a marker is predicted from the pose and its bias, for an
-uncalibrated hand nearly as accurately as for a calibrated one.
+Where the model differs from the user's hand, each marker is off by the same few millimeters in every frame,
+in the frame of its bone. Once this bias is known, a marker is predicted from the pose and the bias: nearly as
+accurately for an uncalibrated hand as for a calibrated one.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _VELOCITY_SMOOTHING: Final = 0.6  # weight of the newest velocity in the smoothe
 _HIDDEN_DIGIT_DAMPING: Final = 0.7  # factor per frame of the velocity of a digit with missing markers
 _WRIST_SPREAD: Final = 0.001  # [m] standard deviation of the wrist's predicted position in the same frame
 _WRIST_ACCELERATION: Final = 10.0  # [m/s^2] process noise
-_WRIST_ROTATION_SPREAD: Final = float(np.deg2rad(1.5))  # [rad] the same of its predicted orientation
+_WRIST_ROTATION_SPREAD: Final = float(np.deg2rad(1.5))  # [rad] as `_WRIST_SPREAD`, of rotation
 _WRIST_ANGULAR_ACCELERATION: Final = 100.0  # [rad/s^2] process noise
 # Measurement model: standard deviations and biases of markers.
 _INITIAL_SPREAD: Final = 1.2  # initial standard deviation of markers over the RMS of the first fit
@@ -47,23 +47,23 @@ _INITIAL_SPREAD_LEAST, _INITIAL_SPREAD_MOST = 0.0015, 0.006  # [m] bounds of it
 _LEAST_MARKER_SPREAD: Final = 0.0005  # [m] lower bound of a marker's noise, as few cameras may see it
 _BIAS_VARIATION: Final = 0.3  # variation of a bias with the pose, as share of the hand's typical bias
 _BIAS_DOUBT_TIME: Final = 0.5  # [s] unseen, after which a marker's bias is unknown again
-_LEFT_OUT_SPREAD: Final = 0.004  # [m] doubt of a marker that the first fit left out: it may have slipped
-_LEFT_OUT_TIME: Final = 0.2  # [s] time in which it grows to its full size; a wrong start is corrected earlier
+_LEFT_OUT_SPREAD: Final = 0.004  # [m] doubt of a marker that the first fit left out, as it may have slipped
+_LEFT_OUT_GROWTH: Final = 0.2  # [s] This doubt grows to its full size in this time; wrong starts end earlier.
 _AVERAGING_FRAMES: Final = 120.0  # averaging window of a bias; one second at 120 Hz
 _FORGETTING_FRAMES: Final = 2400.0  # time constant in which an unconfirmed bias decays
-_FORGOTTEN: Final = 1.7e-7  # [m] additional decay per frame; 0.02 mm in a second at 120 Hz
+_DECAY_PER_FRAME: Final = 1.7e-7  # [m] additional decay of a bias per frame: 0.02 mm in a second at 120 Hz
 _LEARNING_FRAMES: Final = 30.0  # number of frames after which the spread of a hand's markers is known
 _BIAS_REUSE_RMS: Final = 0.002  # [m] A hand initialized again with a smaller RMS keeps its biases.
 _FEWEST_ON_DIGIT, _FEWEST_ON_PALM = 2, 3  # markers needed for a variance estimate
 _BIAS_SLACK: Final = 2.5  # standard deviations allowed between a marker and its design
 # Reappearance of markers, and lifetime of strays.
-_RETURN_TIME: Final = 0.01  # [s] over the hidden time: a marker's probability to return in a frame
-_RETURN_LEAST, _RETURN_MOST = 0.01, 0.65  # bounds of that probability
+_RETURN_SCALE: Final = 0.01  # [s] over the hidden time: probability that a marker returns in a frame
+_RETURN_LEAST, _RETURN_MOST = 0.01, 0.65  # bounds of the probability that a marker returns in a frame
 SEEN_ELSEWHERE: Final = -7.0
 """Log probability that a point is a marker that was seen as another point at the same time."""
-# A point that stays unlabeled while a marker is seen elsewhere is hardly that marker: it loses one log-odds
-# per `_BESIDE_TIME` [s] of it, at most `_MOST_BESIDE`, which outweighs the labeler. The loss fades while the
-# marker is hidden.
+# A point that stays unlabeled while a marker is seen elsewhere is probably not that marker: it loses one
+# log-odds per `_BESIDE_TIME` [s], at most `_MOST_BESIDE`, which outweighs the labeler. The loss fades while
+# the marker is hidden.
 _BESIDE_TIME, _MOST_BESIDE = 0.01, 18.0
 STRAY_LIFETIME: Final = 0.1  # [s] mean lifetime of strays
 MOST_AGE_LOG_ODDS: Final = 3.0  # largest log-odds from a point's age
@@ -154,23 +154,20 @@ class HandState:
         self._now = time
         span = time - self.time
         doubt = self._typical_bias * np.minimum((time - self._last_seen) / _BIAS_DOUBT_TIME, 1.0)
-        # The first fit may leave a marker out because it slipped, so that the RMS does not bound its error.
-        slip = _LEFT_OUT_SPREAD * min((time - self._started) / _LEFT_OUT_TIME, 1.0)
+        # The RMS does not bound the error of a marker that the first fit left out, which may have slipped.
+        slip = _LEFT_OUT_SPREAD * min((time - self._started) / _LEFT_OUT_GROWTH, 1.0)
         doubt[self._left_out & (self._bias_frames == 0.0)] = max(self._typical_bias, slip)
         self.variance = self._learned_variance + doubt**2
         moved: Doubles = move(self.qpos[None], min(span, _LONGEST_EXTRAPOLATION) * self.velocity[None])[0]
-        wrist_spread = (
-            _WRIST_SPREAD + 0.5 * _WRIST_ACCELERATION * span**2,
-            _WRIST_ROTATION_SPREAD + 0.5 * _WRIST_ANGULAR_ACCELERATION * span**2,
-        )
-        return self._prediction(moved, predict_joints(moved[7:], self._joint_covariance, span), wrist_spread)
+        position = _WRIST_SPREAD + 0.5 * _WRIST_ACCELERATION * span**2
+        rotation = _WRIST_ROTATION_SPREAD + 0.5 * _WRIST_ANGULAR_ACCELERATION * span**2
+        joints = predict_joints(moved[7:], self._joint_covariance, span)
+        return self._prediction(moved, joints, (position, rotation))
 
-    def _prediction(
-        self, qpos: Doubles, joint_prior: JointPrior, wrist_spread: tuple[float, float]
-    ) -> Prediction:
+    def _prediction(self, qpos: Doubles, prior: JointPrior, wrist_spread: tuple[float, float]) -> Prediction:
         """Make a prediction from a pose with these uncertainties."""
-        priors = priors_of_frame(joint_prior.angles, joint_prior.spread, qpos[:7], wrist_spread)
-        return Prediction(qpos, self.solver.marker_positions(qpos), joint_prior, wrist_spread, priors)
+        priors = priors_of_frame(prior.angles, prior.spread, qpos[:7], wrist_spread)
+        return Prediction(qpos, self.solver.marker_positions(qpos), prior, wrist_spread, priors)
 
     def fit(
         self, targets: Float[np.ndarray, "M 3"], start: Float[np.ndarray, "27"], prediction: Prediction
@@ -181,30 +178,18 @@ class HandState:
             qpos, rms, residuals = fit.qpos[0], float(fit.rms[0]), fit.residuals[0]
         else:
             qpos, rms, residuals = prediction.qpos, np.nan, np.full_like(targets, np.nan)
-        predicted = predict_markers(
-            self.solver.hand,
-            self.solver.on_part,
-            qpos,
-            targets,
-            prediction.joint_prior,
-            prediction.wrist_spread,
-            self.variance,
-            self.config.marker_noise,
-        )
+        hand, on_part, noise = self.solver.hand, self.solver.on_part, self.config.marker_noise
+        prior = prediction.joint_prior, prediction.wrist_spread
+        predicted = predict_markers(hand, on_part, qpos, targets, *prior, self.variance, noise)
         return HandEstimate(predicted.qpos, rms, residuals, predicted)
 
     def digit_models(self, prediction: Prediction, estimate: HandEstimate) -> tuple[DigitModel, DigitModel]:
         """Models for new points of a digit: one for digits with settled labels, one for others."""
         # The second uses the resting prior, so that a pose bent by a wrong label cannot confirm it.
         slack = _BIAS_SLACK * np.sqrt(self.variance) + np.sqrt((self._bias**2).sum(axis=1))
-        confirmed = DigitModel(
-            prediction.joint_prior,
-            estimate.predicted,
-            self.variance,
-            peak_log_odds(self.variance, self.config.stray_density),
-            slack,
-            self._ranges,
-        )
+        peaks = peak_log_odds(self.variance, self.config.stray_density)
+        markers = self.variance, peaks, slack, self._ranges
+        confirmed = DigitModel(prediction.joint_prior, estimate.predicted, *markers)
         return confirmed, confirmed._replace(joint_prior=resting_prior())
 
     def pose_spread(self, time: float) -> Callable[[], Spreads]:
@@ -228,8 +213,8 @@ class HandState:
     ) -> Float[np.ndarray, "P M"]:
         """Log-odds that a point is a marker, which returned when the point appeared, and not a stray.
 
-        A point that had no label while the marker was seen is likely foreign. This counts only for markers
-        that no point has now.
+        A point that had no label while the marker was seen is probably foreign. This counts only for markers
+        that currently have no point.
         """
         return np.asarray(_presence_log_odds(first_seen, free_since, markers, self._last_seen, self._now))
 
@@ -299,16 +284,11 @@ class HandState:
             change = velocity_of(self.qpos, qpos, span) - self.velocity
             self.velocity += _VELOCITY_SMOOTHING * change
         self._store(estimate, time)
-        _learn_bias(
-            estimate.residuals,
+        rotations, learned = (
             estimate.predicted.rotations,
-            settled,
-            self.digits,
-            self.confirmed,
-            self._bias_frames,
-            self._bias,
-            self._learned_variance,
+            (self._bias_frames, self._bias, self._learned_variance),
         )
+        _learn_bias(estimate.residuals, rotations, settled, self.digits, self.confirmed, *learned)
         self._apply_biases()
 
     def _store(self, estimate: HandEstimate, time: float) -> None:
@@ -325,14 +305,8 @@ class HandState:
 
     def _apply_biases(self) -> None:
         """Shift the hand's markers by their learned biases, and update the typical bias and the variances."""
-        self._typical_bias = _apply_biases(
-            self._bias_frames,
-            self._left_out,
-            self._bias,
-            self._designed,
-            self._learned_variance,
-            self.solver.hand.positions,
-        )
+        state = self._bias_frames, self._left_out, self._bias, self._designed, self._learned_variance
+        self._typical_bias = _apply_biases(*state, self.solver.hand.positions)
 
 
 class HandTrack(NamedTuple):
@@ -362,7 +336,7 @@ def _presence_log_odds(
         age = min(max(now - first_seen[point], 0.0) / STRAY_LIFETIME, MOST_AGE_LOG_ODDS)
         for marker in range(len(last_seen)):
             gap, beside = first_seen[point] - last_seen[marker], 0.0
-            share = min(max(_RETURN_TIME / max(gap, 1e-3), _RETURN_LEAST), _RETURN_MOST)
+            share = min(max(_RETURN_SCALE / max(gap, 1e-3), _RETURN_LEAST), _RETURN_MOST)
             if missing[marker] and last_seen[marker] > free_since[point]:
                 beside = min((last_seen[marker] - free_since[point]) / _BESIDE_TIME, _MOST_BESIDE)
                 beside -= (now - last_seen[marker]) / STRAY_LIFETIME
@@ -415,7 +389,7 @@ def _learn_bias(
         bias_frames[marker] = min(bias_frames[marker] + 1.0, _AVERAGING_FRAMES)
         # The pose also absorbs what all biases have in common; only the decay corrects that.
         length = np.sqrt(bias[marker, 0] ** 2 + bias[marker, 1] ** 2 + bias[marker, 2] ** 2)
-        kept = max(1.0 - 1.0 / _FORGETTING_FRAMES - _FORGOTTEN / length, 0.0)
+        kept = max(1.0 - 1.0 / _FORGETTING_FRAMES - _DECAY_PER_FRAME / length, 0.0)
         square = 0.0
         for i in range(3):
             residual[i] = 0.0

@@ -23,34 +23,33 @@ from poses.shapes import LIBRARIES, gestures_of
 from track.association.frame_state import match_log_odds, match_points, peak_log_odds, targets_of
 from track.association.hand_state import HandState
 from track.config import TrackerConfig
-from track.kinematics.pose_solver import FEWEST_MARKERS, PoseFit, PoseSolver
+from track.kinematics.pose_solver import FEWEST_MARKERS, OUTLIER_DISTANCE, PoseFit, PoseSolver
 from track.kinematics.pose_spread import resting_prior
 from train.labelers.protocol import MAX_POINTS, Labeler
 
 MOST_POINTS: Final = 100  # A larger group of points is no hand.
 _LINK_DISTANCE: Final = 0.085  # [m] least linking distance between neighboring markers of a hand
-_LINKED_GESTURES: Final = 0.99  # share of gestures in which all markers of a hand must be linked
+_LINKED_SHARE: Final = 0.99  # All markers of a hand are linked in this share of the gestures.
 _LEAST_LABELED_SHARE: Final = 0.45  # least share of a hand's markers with a label
 SPARE_POINTS: Final = 6
 """A group of points may be two touching hands, and is cut, if it has this many points more than a hand has
 markers. `_SPARE_SHARE` of the markers counts instead if that is less."""
 _SPARE_SHARE: Final = 0.3  # of a hand's markers, because ghosts resemble few markers
-_CUTS: Final = 12  # number of directions of cuts, even over half a sphere
-_CUTS_OF_SEARCH: Final = 6  # directions per search in continuous frames; the next search has the others
-_STRIDE: Final = 5  # step between successive directions, so that any few are spread evenly
-_CUTS_AT_FIRST: Final = 3  # directions tried in the first call; mostly one of them suffices
-_LAST_TURN: Final = _CUTS_OF_SEARCH - _CUTS_AT_FIRST  # turn in which a search ends
+_NUM_CUTS: Final = 12  # number of directions of cuts, even over half a sphere
+# number of directions per search in continuous frames; the next search tries the others
+_CUTS_OF_SEARCH: Final = 6
+_CUT_STRIDE: Final = 5  # step between successive directions, so that any few are spread evenly
+_CUTS_AT_FIRST: Final = 3  # number of directions in the first call; mostly one of them suffices
+_LAST_CALL: Final = _CUTS_OF_SEARCH - _CUTS_AT_FIRST  # turn in which a search ends
 _DIGIT_EXCHANGE_DISTANCE: Final = 0.06  # [m] Digits of two hands closer than this may be exchanged.
 _FITS_AT_A_TIME: Final = 3  # number of labeled clouds fitted at once, the most confident first
-# Steps from each starting pose; enough to distinguish a hand from its mirror image.
-_FIRST_FIT_STEPS: Final = 6
+_FIRST_FIT_STEPS: Final = 6  # steps from each starting pose; they distinguish a hand from its mirror image
 _REFIT_STEPS: Final = 8  # from a close pose; the final fit is solved again
-_OUTLIER_DISTANCE: Final = 0.01  # [m] Labels farther from a robust fit are wrong.
-# A robust fit must keep this share of the labels; that of a mirrored hand keeps fewer.
+# A robust fit must keep this share of the labels; a mirrored hand's does not.
 _LEAST_KEPT_LABELS: Final = 0.75
 _POSE_WEIGHT: Final = 0.25  # log-odds lost per squared standard deviation beyond the expected sum
 _MOST_POSE_PENALTY: Final = 20.0  # bound of that loss, because people make unusual poses
-_REFINEMENTS: Final = 2  # rounds of matching points with the fitted hand's markers
+_REFINEMENT_ROUNDS: Final = 2  # rounds of matching points with the fitted hand's markers
 _SEARCH_FACTOR: Final = 4.0  # standard deviation of markers in these rounds over that of the fit
 _SEARCH_LEAST, _SEARCH_MOST = 0.003, 0.012  # [m] bounds of it
 _FREE_COORDINATES: Final = 20.0  # effective degrees of freedom of a pose
@@ -61,15 +60,14 @@ _MARKERS_OF_EVIDENCE: Final = 10  # Evidence is required for at most this many m
 # find it again.
 _LEAST_REPEATED: Final = 0.5
 _REPETITION: Final = 5.0  # log-odds that each earlier call with the same hand adds
-_SAME_RMS: Final = 0.008  # [m] Markers of one hand in two calls differ by less, up to a rigid motion.
+_SAME_HAND_RMS: Final = 0.008  # [m] Markers of one hand in two calls differ by less, up to a rigid motion.
 _CERTAIN_SCORE: Final = 5.5  # log-odds per marker from which no further cloud is tried
 _HOPELESS_FACTOR: Final = 2.5  # A mirrored hand has an RMS distance this many times the best one's.
 _GOOD_RMS: Final = 0.003  # [m] The best hand must fit this well to reject its mirror image.
 _HOPELESS_SHARE: Final = 0.8  # The best hand must keep this share of the mirrored hand's labels.
 _KNOWN_SPREAD_ATTEMPTS: Final = 60  # attempts in which a known hand must fit as before; 0.5 s at 120 Hz
 CLOUD_RADIUS: Final = 0.06  # [m] distance from a hand's points within which others may be its markers
-# If this share of the frames shows a hand, all are assumed to do so.
-_USUAL_HAND_SHARE: Final = 0.5
+_USUAL_HAND_SHARE: Final = 0.5  # If this share of the frames shows a hand, all are assumed to show one.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,12 +121,12 @@ class HandInitializer:
         links = [_link_distance(one.hand) for one in states[:1]]  # The other hand is its mirror image.
         self._link_distance = max([_LINK_DISTANCE, *links])
         self._prior = resting_prior()
-        self._robust = [PoseSolver(one.hand, outlier_distance=_OUTLIER_DISTANCE) for one in states]
+        self._robust = [PoseSolver(one.hand, outlier_distance=OUTLIER_DISTANCE) for one in states]
         self._attempts = np.zeros(len(states), dtype=np.int64)
         self._spreads: list[float | None] = [None] * len(states)
         self._points: Doubles = np.empty((0, 3))  # of the current frame
-        spread = np.arange(_CUTS) + 0.5
-        height, azimuth = 1.0 - spread / _CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even over half a sphere
+        spread = np.arange(_NUM_CUTS) + 0.5
+        height, azimuth = 1.0 - spread / _NUM_CUTS, np.pi * (1.0 + 5.0**0.5) * spread  # even directions
         flat = np.sqrt(1.0 - height**2)
         self._directions = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), height], axis=1)
 
@@ -159,7 +157,7 @@ class HandInitializer:
         initialized = self._sides_checked(initialized)
         for hand in initialized:
             self._attempts[hand.index] = 0
-        if cut and not initialized and search.turn < _LAST_TURN and not self._at_once:
+        if cut and not initialized and search.turn < _LAST_CALL and not self._at_once:
             search.turn += 1
             self._searches[tuple(hands)] = search
         else:
@@ -194,14 +192,13 @@ class HandInitializer:
             return True
         # A hand that was found more often outlasts another one in between.
         outlasts = now.evidence == 0.0 < before.evidence
-        self._repeated[hand.index] = (
-            before._replace(evidence=before.evidence - _REPETITION) if outlasts else now
-        )
+        now = before._replace(evidence=before.evidence - _REPETITION) if outlasts else now
+        self._repeated[hand.index] = now
         return False
 
     def _sides_checked(self, hands: list[InitializedHand]) -> list[InitializedHand]:
         """Exchange the sides of two hands if both together fit better so."""
-        # Each cloud alone may fit the wrong hand best: without a marker on the thumb, a symmetric layout fits
+        # A single cloud may fit the wrong hand best: without a marker on the thumb, a symmetric layout fits
         # both hands almost equally.
         if len(hands) != 2:
             return hands
@@ -244,7 +241,7 @@ class HandInitializer:
             return best
         if best is not None and best.score > search.score:
             search.score, search.best_turn = best.score, search.turn
-        if search.turn < _LAST_TURN or search.score == -np.inf:
+        if search.turn < _LAST_CALL or search.score == -np.inf:
             return None
         if search.best_turn == search.turn:
             return best
@@ -294,8 +291,8 @@ class HandInitializer:
         most = max(self._states[index].num_markers for index in hands)
         if len(group) <= most + min(SPARE_POINTS, _SPARE_SHARE * most):
             return np.empty(0, dtype=np.int64)
-        count = _CUTS if self._at_once else _CUTS_OF_SEARCH
-        numbers = _STRIDE * (self._first_cut + np.arange(count)) % _CUTS
+        count = _NUM_CUTS if self._at_once else _CUTS_OF_SEARCH
+        numbers = _CUT_STRIDE * (self._first_cut + np.arange(count)) % _NUM_CUTS
         return numbers[np.argsort(-(self._points[group] @ self._directions[numbers].T).std(axis=0))]
 
     def _clouds_of_turn(self, group: Integers, cuts: Integers, turn: int) -> list[Integers]:
@@ -312,7 +309,7 @@ class HandInitializer:
         hand = self._trim(first) or self._trim(self._without_outliers(first))
         if hand is None and share < 1.0:
             hand = self._trim(first, share)
-        for _ in range(_REFINEMENTS):
+        for _ in range(_REFINEMENT_ROUNDS):
             if hand is None:
                 return None
             positions = state.solver.marker_positions(hand.fit.qpos[0])
@@ -343,9 +340,8 @@ class HandInitializer:
         points, digits = self._points, self._states[hands[0].index].solver.hand.digits
         for digit in range(len(DIGITS)):
             one, two = hands
-            ours, theirs = (
-                np.flatnonzero((hand.labels >= 0) & (digits[hand.labels] == digit)) for hand in (one, two)
-            )
+            on_digit = [(hand.labels >= 0) & (digits[hand.labels] == digit) for hand in (one, two)]
+            ours, theirs = map(np.flatnonzero, on_digit)
             if not len(ours) or not len(theirs):
                 continue
             if distances_to_nearest(points[ours], points[theirs]).min() > _DIGIT_EXCHANGE_DISTANCE:
@@ -373,12 +369,9 @@ class HandInitializer:
             labels = hand.labels.copy()
             labels[labeled[squares.argmax()]] = -1
             hand = self._fit(hand.index, labels, hand.fit)
-        accepted = (
-            best is not None
-            and best.fit.rms[0] <= self._config.most_rms
-            and best.score >= share * self._needed(best.index)
-        )
-        return best if accepted else None
+        if best is None or not best.fit.rms[0] <= self._config.most_rms:
+            return None
+        return best if best.score >= share * self._needed(best.index) else None
 
     def _without_outliers(self, first: InitializedHand) -> InitializedHand | None:
         """Drop labels that are outliers of a robust fit; None if these are too many."""
@@ -387,14 +380,14 @@ class HandInitializer:
         targets = targets_of(self._points, first.labels, state.num_markers)
         fit = self._robust[first.index].solve(targets[None], iterations=_FIRST_FIT_STEPS)
         distances = np.linalg.norm(fit.residuals[0], axis=-1)
-        kept = (first.labels >= 0) & (distances[first.labels] < _OUTLIER_DISTANCE)
+        kept = (first.labels >= 0) & (distances[first.labels] < OUTLIER_DISTANCE)
         if kept.sum() < _LEAST_KEPT_LABELS * (first.labels >= 0).sum():
             return None
         return self._fit(first.index, np.where(kept, first.labels, -1), fit)
 
     def _fit(self, index: int, labels: Integers, near: PoseFit | None = None) -> InitializedHand | None:
         """Fit a hand to labeled points, starting from `near` if given; None if there are too few points."""
-        # Unusual poses lower the score; a hand seen recently must fit as well as before.
+        # Unusual poses lower the score. A hand that was seen recently must fit as well as before.
         count, state = int((labels >= 0).sum()), self._states[index]
         if count < self._fewest_labeled(index):
             return None
@@ -422,7 +415,7 @@ def _is_same(before: Float[np.ndarray, "M 3"], markers: Float[np.ndarray, "M 3"]
         return False
     rotation, shift = rigid_fit(before[both], markers[both])
     off = before[both] @ rotation.T + shift - markers[both]
-    return bool((off**2).sum(axis=1).mean() < _SAME_RMS**2)
+    return bool((off**2).sum(axis=1).mean() < _SAME_HAND_RMS**2)
 
 
 def _is_mirrored(first: InitializedHand, best: InitializedHand) -> bool:
@@ -436,7 +429,7 @@ def _link_distance(hand: GloveFit) -> float:
     """Distance that links all neighboring markers of a hand in most gestures [m]."""
     gestures = np.concatenate([gestures_of(library) for library in LIBRARIES])
     markers, _ = hand.markers(join_qpos(gestures))
-    return float(np.quantile(longest_links(markers), _LINKED_GESTURES))
+    return float(np.quantile(longest_links(markers), _LINKED_SHARE))
 
 
 def label_alone(

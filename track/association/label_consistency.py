@@ -40,7 +40,7 @@ _RESTART_STEPS: Final = 8  # steps from each of these poses; the best result is 
 # [m] `CLOUD_RADIUS` for missing markers of a digit without labels, which may be bent or straight
 _DIGIT_CLOUD_RADIUS: Final = 0.13
 _FIRST_REVIEW_WAIT: Final = 0.01  # [s] from a review with changes to the next one
-_REVIEW_WAIT_FACTOR: Final = 1.6  # factor of that time after each review without changes
+_REVIEW_WAIT_FACTOR: Final = 1.6  # factor of the wait after each review without changes
 _DOUBTED_PRESENCE: Final = -2.0  # log probability of a marker that the track saw elsewhere at the same time
 _REVIEW_MARGIN: Final = 8.0  # log-odds by which the labeler's labels must be better than those of the track
 # A bias is doubted if a point's distance without it is less than this share of that with it.
@@ -250,9 +250,8 @@ class LabelerReview:
             return None
         proposal = _Proposal(proposed, confidence, estimate)
         gain = self._gain(frame, track, proposal)
-        changes = {
-            (int(frame.ids[row]), int(after[row])) for row in np.flatnonzero((after != before) & (after >= 0))
-        }
+        new = np.flatnonzero((after != before) & (after >= 0))
+        changes = {(int(frame.ids[row]), int(after[row])) for row in new}
         earlier = self._earlier[track.hand]
         times = min((earlier.get(change, 0) for change in changes), default=0)
         if gain + _REPEATED_REVIEW_LOG_ODDS * times >= _REVIEW_MARGIN:

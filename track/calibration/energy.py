@@ -91,6 +91,8 @@ QUICK_OPTIONS: Final = {"noise": 0.003, "robust_scale": 0.015, "relinearize": 0.
 """Options of a `Problem` with few frames [m]; the noise is that of flesh, which repeats in similar frames."""
 QUICK_GAIN: Final = 1e-3
 """`SMALL_GAIN` of a problem with `QUICK_OPTIONS`; it may leave a hand's length off by 0.2 mm."""
+COARSE_RELINEARIZE: Final = 0.2
+"""`relinearize` of a search for marker places; less changes no probability by more than 0.01."""
 
 
 class Contacts(NamedTuple):
@@ -177,7 +179,7 @@ class Problem:
         self._linearized_at = np.zeros(NUM_PARAMETERS)
 
     def with_targets(self, targets: Float[np.ndarray, "F M 3"]) -> Problem:
-        """The same problem for other labeled markers [m], NaN where missing."""
+        """Return a copy of this problem for other labeled markers [m], NaN where missing."""
         other = copy.copy(self)
         other._set_targets(targets)
         return other
@@ -280,13 +282,8 @@ class Problem:
         """
         by_pose, by_shared, residuals, moved = jacobians or self.weighted_jacobians(estimate, fit)
         transposed, flat = by_pose.swapaxes(1, 2), by_shared.reshape(-1, by_shared.shape[2])
-        result = NormalEquations(
-            transposed @ by_pose,
-            transposed @ by_shared,
-            flat.T @ flat,
-            (transposed @ residuals[..., None])[..., 0],
-            residuals.ravel() @ flat,
-        )
+        gradients = (transposed @ residuals[..., None])[..., 0], residuals.ravel() @ flat
+        result = NormalEquations(transposed @ by_pose, transposed @ by_shared, flat.T @ flat, *gradients)
         self._add_priors(estimate, fit, moved, result)
         return result
 
@@ -315,15 +312,13 @@ class Problem:
         parts = zip(estimate.coordinates, self.design, pads, strict=True)
         return SkinCoordinates(*map(np.concatenate, parts))
 
-    def _add_priors(
-        self, estimate: Estimate, fit: Fit, design_jacobian: Doubles, result: NormalEquations
-    ) -> None:
-        """Add the priors; `design_jacobian` (M, 3, 53) is of marker minus design at fixed coordinates."""
+    def _add_priors(self, estimate: Estimate, fit: Fit, by_shape: Doubles, result: NormalEquations) -> None:
+        """Add the priors; `by_shape` (M, 3, 53) is the jacobian of marker minus design, coordinates fixed."""
         first, count = NUM_PARAMETERS, len(estimate.points)
         by_marker = np.eye(3 * count).reshape(count, 3, -1)
         result.shared[:first, :first] += self.precision
         result.shared_gradient[:first] += self.precision @ estimate.parameters
-        jacobian = np.concatenate([design_jacobian, by_marker], axis=2)
+        jacobian = np.concatenate([by_shape, by_marker], axis=2)
         weighted = self.position_precision(fit) @ jacobian
         result.shared[:] += np.einsum("mis,mir->sr", jacobian, weighted, optimize=True)
         result.shared_gradient[:] += np.einsum("mi,mis->s", fit.design_residuals, weighted)
@@ -353,10 +348,8 @@ class Problem:
         rows, pads = np.arange(count), self._all_coordinates(estimate).part(-2 * count, None)
         points, _ = skin_points(pads, SkinPatch(pads.faces).corners(fit.model.surface.vertices))
         by = self._point_jacobians(fit, estimate, frames, points, skin_weights(pads), rest)
-        return [
-            np.einsum("ki,kis->ks", fit.geometry.directions, one[rows, count + rows] - one[rows, rows])
-            for one in by[:2]
-        ]
+        apart = (one[rows, count + rows] - one[rows, rows] for one in by[:2])
+        return [np.einsum("ki,kis->ks", fit.geometry.directions, one) for one in apart]
 
     def _point_jacobians(
         self,
@@ -386,9 +379,8 @@ class Problem:
         points = carried + shared_step[NUM_PARAMETERS:].reshape(-1, 3)
         qpos = move(estimate.qpos, np.clip(pose_step, -0.5, 0.5))
         coordinates = project_onto_skin(estimate.coordinates, points, skin)
-        return dataclasses.replace(
-            estimate, parameters=parameters, points=points, coordinates=coordinates, qpos=qpos
-        )
+        changes = {"parameters": parameters, "points": points, "coordinates": coordinates, "qpos": qpos}
+        return dataclasses.replace(estimate, **changes)
 
 
 def first_estimate(
@@ -422,11 +414,8 @@ def find_touches(
         good = (speed < _MOST_TOUCH_SPEED) & (gaps[:, number] < _MOST_TOUCH_GAP)
         good &= (gaps.argmin(axis=1) == number) & complete[:, 0] & complete[:, number + 1]
         shortest = max(2, round(_SHORTEST_HOLD * rate))
-        stillest = [
-            first + int(speed[first : last + 1].argmin())
-            for first, last in runs_of(good)
-            if last + 1 - first >= shortest
-        ]
+        holds = [(first, last) for first, last in runs_of(good) if last + 1 - first >= shortest]
+        stillest = [first + int(speed[first : last + 1].argmin()) for first, last in holds]
         stillest.sort(key=lambda frame, number=number: float(gaps[frame, number]))  # type: ignore[misc]
         touches += [(frame, finger) for frame in stillest[:_MOST_TOUCHES_PER_FINGER]]
     return sorted(touches)
@@ -489,10 +478,8 @@ def _nearest_skin_points(model: HandModel, bones: Doubles, finger: str) -> Doubl
     return np.asarray(ends + radii[:, None] * np.stack([direction, -direction]))
 
 
-def slide_contacts(
-    contacts: Contacts, model: HandModel, T_world_bone: Float[np.ndarray, "K L 4 4"]
-) -> Contacts:
-    """Slide the contact points on the skin to where thumb and finger are nearest."""
+def slide_contacts(contacts: Contacts, model: HandModel, T_world_bone: Doubles) -> Contacts:
+    """Slide contact points on the skin to where thumb and finger are nearest, in a pose (L, 4, 4) each."""
     # Each point moves to where its skin is nearest to a target inside the other pad. A target on the surface
     # of the other pad would fail if the pads overlap.
     skin, count = build_skin(model.shape), len(contacts.frames)

@@ -18,10 +18,10 @@ from gloves.fit import Attachment
 from gloves.layout import MarkerLayout
 from handsim.arrays import Doubles, Integers
 from handsim.hand.model import HandModel, metacarpal_rotations
-from handsim.hand.shape import ADULTS, DIGIT_OF_BONE, DIGITS, HandShape, named_shape
+from handsim.hand.shape import ADULTS, DIGIT_OF_BONE, DIGITS, HandShape, Side, named_shape
 from handsim.hand.skin import all_weights, build_surface, catmull_clark, strongest_weights, vertex_normals
 from handsim.kernels import CARPUS
-from handsim.space.transforms import euler_axes
+from handsim.space.transforms import MIRROR, euler_axes
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -57,6 +57,11 @@ def shape_at(start: HandShape, parameters: Float[np.ndarray, "53"]) -> HandShape
         radii=start.radii * across * np.exp(parameters[GIRTHS])[:, None],
         palm_thickness=float(start.palm_thickness * across * np.exp(parameters[THICKNESS])),
     )
+
+
+def mirror_to_right(side: Side) -> Doubles:
+    """The matrix (3, 3) that makes points of a hand those of a right one: it mirrors left ones."""
+    return MIRROR if side == "left" else np.eye(3)
 
 
 def shape_precision() -> Float[np.ndarray, "53 53"]:
@@ -108,10 +113,8 @@ def skinned_shape_jacobian(
     turns = turns.cumsum(axis=3)[:, :, :, ::-1]
     after = shares[:, :, ::-1].cumsum(axis=2)[:, :, ::-1, None]
     jacobian = np.zeros((frames, count, 3, NUM_PARAMETERS))
-    of_digits = [
-        jacobian[..., one].reshape(frames, count, 3, len(DIGITS), 3)
-        for one in (BONE_LENGTHS, KNUCKLES, DIRECTIONS)
-    ]
+    groups = BONE_LENGTHS, KNUCKLES, DIRECTIONS
+    of_digits = [jacobian[..., group].reshape(frames, count, 3, len(DIGITS), 3) for group in groups]
     by_length, by_knuckle, by_direction = (np.moveaxis(one, 2, -1) for one in of_digits)
     along = (turns[:, :, :, 1:] @ rest[:, :2, :3, :1])[..., 0]
     by_length[:, :, :, :2] = after[:, :, 1:] * digits[:, None, :, :2, :3, 0] - along
@@ -289,7 +292,6 @@ def project_onto_skin(
 ) -> SkinCoordinates:
     """Coordinates of points [m], by Newton steps that walk between adjacent triangles."""
     # Where the skin folds, the walk may not converge: the foot point then stays on the last edge.
-    mesh = skin_mesh()
     faces, bary, heights = (values.copy() for values in coordinates)
     active = np.arange(len(faces))
     for _ in range(_MOST_PROJECTION_STEPS):
@@ -306,18 +308,16 @@ def project_onto_skin(
         edge: Doubles = inside / inside.sum(axis=1, keepdims=True)
         bary[active] = np.where(out[:, None], np.where(np.isfinite(edge), edge, here.bary), moved)
         done = ~out & (np.linalg.norm(residual, axis=1) < _PROJECTION_TOLERANCE)
-        _cross_edges(mesh, faces, bary, active[out], lowest[out])
+        _cross_edges(faces, bary, active[out], lowest[out])
         active = active[~done]
         if not len(active):
             break
     return SkinCoordinates(faces, bary, heights)
 
 
-def _cross_edges(
-    mesh: SkinTopology, faces: Integers, bary: Doubles, crossing: Integers, corner: Integers
-) -> None:
+def _cross_edges(faces: Integers, bary: Doubles, crossing: Integers, corner: Integers) -> None:
     """Move the points `crossing` over the edges opposite to `corner`; changes `faces` and `bary`."""
-    old = faces[crossing]
+    mesh, old = skin_mesh(), faces[crossing]
     new = mesh.adjacent[old, corner]
     same = mesh.faces[new][:, :, None] == mesh.faces[old][:, None, :]
     shares = np.where(np.arange(3) == corner[:, None], 0.0, bary[crossing])

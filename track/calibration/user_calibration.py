@@ -53,6 +53,7 @@ from track.calibration.hand_parameters import (
     LENGTH,
     NUM_PARAMETERS,
     SkinPatch,
+    mirror_to_right,
     shape_at,
     shape_jacobian,
     skin_points,
@@ -118,9 +119,9 @@ class HeldOut(NamedTuple):
     before: float
     """Median over frames of the markers' RMS distance from the hand before calibration [m]."""
     after: float
-    """The same with the calibrated hand [m]."""
+    """Median over frames of the markers' RMS distance from the calibrated hand [m]."""
     num_frames: int
-    """Number of frames."""
+    """Number of held-out frames."""
     other_labels: str = ""
     """Labels that fit the points better than those that were given, such as "RH1 and RH6 are exchanged"."""
 
@@ -140,7 +141,7 @@ class Calibration:
     rms_before: float
     """Median over frames of the markers' RMS distance from the hand before [m]."""
     rms_after: float
-    """The same with the calibrated hand [m]."""
+    """Median over frames of the markers' RMS distance from the calibrated hand [m]."""
     shifts: Float[np.ndarray, "M"]
     """Distance of each marker from its designed position on this hand [m]."""
     position_errors: Float[np.ndarray, "M"]
@@ -255,7 +256,7 @@ def calibrate_hand(
     markers: Float[np.ndarray, "T M 3"], start: GloveFit, rate: float, *, progress: Progress | None = None
 ) -> Calibration:
     """Fit a hand and its glove to labeled markers of one user."""
-    mirror = MIRROR if start.side == "left" else np.eye(3)
+    mirror = mirror_to_right(start.side)
     markers, right = np.asarray(markers, dtype=np.float64) @ mirror, start.with_side("right")
     usable = usable_frames(markers, start)
     seen, complete = markers[usable], complete_digits(markers[usable], right.attachment)
@@ -461,9 +462,8 @@ def learn_arch(problem: Problem, estimate: Estimate) -> None:
         if min(weights[knuckle, [PALM, first]]) <= _KNUCKLE_WEIGHT or on_bone[outer] < 0.5 or not seen.any():
             continue
         ends = np.einsum("tij,tmj->tmi", turns, problem.targets[:, [knuckle, outer]]) + shifts[:, None]
-        flexions = [
-            np.arctan2(-link[:, 2], link[:, 0])[seen] for link in (ends[:, 0] - base, ends[:, 1] - ends[:, 0])
-        ]
+        links = ends[:, 0] - base, ends[:, 1] - ends[:, 0]
+        flexions = [np.arctan2(-link[:, 2], link[:, 0])[seen] for link in links]
         metacarpal, bone = (flexion - flexion.mean() for flexion in flexions)
         slope = (bone @ metacarpal) / max(float(bone @ bone), 1e-12)
         scatter = (metacarpal - slope * bone).var() + _LEAST_FLEXION_NOISE**2

@@ -8,7 +8,13 @@ import numpy as np
 from jaxtyping import Float
 
 from gloves.fit import GloveFit
-from track.calibration.energy import GESTURES_OF_USER, first_estimate, levenberg_marquardt, user_hand
+from track.calibration.energy import (
+    COARSE_RELINEARIZE,
+    GESTURES_OF_USER,
+    first_estimate,
+    levenberg_marquardt,
+    user_hand,
+)
 from track.kinematics.pose_solver import PoseSolver
 
 FLESH: Final = 0.003
@@ -17,7 +23,6 @@ _LEAST_FLESH: Final = 0.001  # [m] lower bound: a fit absorbs errors that repeat
 _PLACE_SPREAD: Final = 0.02  # [m] standard deviation of a marker along the skin from a roughly known place
 _HEIGHT_SPREAD: Final = 0.0015  # [m] standard deviation of a marker's height over the skin
 _ROBUST_SCALE, _OUTLIER_DISTANCE = 0.02, 0.03  # [m] robust scales of markers and poses
-_RELINEARIZE: Final = 0.2  # The skin's jacobian is renewed after such a change, see `Problem`.
 _MOST_STEPS: Final = 20
 ROUGH, FINE = 3e-2, 1e-3
 """A fit ends once a step gains a smaller share of its energy."""
@@ -45,7 +50,7 @@ def fit_places(
         gain: Share of the energy that a step must gain; with less the fit ends.
     """
     poses = PoseSolver(glove, outlier_distance=_OUTLIER_DISTANCE).solve(points).qpos
-    options = {"noise": flesh, "robust_scale": _ROBUST_SCALE, "relinearize": _RELINEARIZE}
+    options = {"noise": flesh, "robust_scale": _ROBUST_SCALE, "relinearize": COARSE_RELINEARIZE}
     problem, estimate = first_estimate(glove, points, poses, gestures=GESTURES_OF_USER, **options)
     problem.position_spread, problem.height_spread = _PLACE_SPREAD, _HEIGHT_SPREAD
     estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _MOST_STEPS, None, gain)

@@ -152,10 +152,9 @@ def improve_glove(
 
 def verdict(before: Mapping[str, Trial], after: Mapping[str, Trial]) -> str:
     """One sentence on whether a layout did better in captures than another one."""
-    slots, joints = (
-        [float(np.mean([measure(one) for one in trials.values()])) for trials in (before, after)]
-        for measure in (lambda one: float(one.right.mean()), lambda one: one.joint_error)
-    )
+    tried = [list(trials.values()) for trials in (before, after)]
+    slots = [float(np.mean([float(one.right.mean()) for one in trials])) for trials in tried]
+    joints = [float(np.mean([one.joint_error for one in trials])) for trials in tried]
     told = (
         f"{100 * slots[0]:.2f} % of the slots were right before and {100 * slots[1]:.2f} % after, joints "
         f"{joints[0]:.1f} and {joints[1]:.1f} deg off"
@@ -179,15 +178,12 @@ class Columns(NamedTuple):
     def chosen(self, columns: Sequence[int] | Int[np.ndarray, "Q"]) -> Columns:
         """Select columns in this order."""
         rows = np.asarray(columns)
-        return Columns(
-            tuple(self.places[column] for column in rows),
-            self.positions[:, rows],
-            self.seen[:, rows],
-            tuple({name: table[rows] for name, table in one.items()} for one in self.worn),
-        )
+        places = tuple(self.places[column] for column in rows)
+        worn = tuple({name: table[rows] for name, table in one.items()} for one in self.worn)
+        return Columns(places, self.positions[:, rows], self.seen[:, rows], worn)
 
     def renamed(self, number: int, name: str) -> Columns:
-        """The same columns with one renamed."""
+        """Return these columns with another name of the one at `number`."""
         places = list(self.places)
         places[number] = dataclasses.replace(places[number], name=name)
         return self._replace(places=tuple(places))
@@ -412,10 +408,8 @@ class Improvement:
         if bone != PALM:
             margin = _CREASE_MARGIN / float(self._model.skeleton.lengths[bone])
             low, high = margin, _MOST_ALONG_TIP if place.bone.endswith("distal") else 1.0 - margin
-        along, around, across = (
-            round(step * round(value / step), 6)
-            for value, step in zip((place.along, place.around, place.across), _GRID, strict=True)
-        )
+        numbers = zip((place.along, place.around, place.across), _GRID, strict=True)
+        along, around, across = (round(step * round(value / step), 6) for value, step in numbers)
         fits = low <= along <= high and abs(around) <= _PADS and abs(across) <= _PALM_ACROSS
         return dataclasses.replace(place, along=along, around=around, across=across) if fits else None
 

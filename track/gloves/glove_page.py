@@ -24,11 +24,10 @@ if TYPE_CHECKING:
 _SCALE_END_DEG: Final = 15.0  # [deg] end of the color scale
 _TRIALS_TEXT: Final = (
     "A capture is wrong throughout if some marker is right in fewer than half of its frames; other captures "
-    "count with the probability of other labels that the take itself states. Shares of right slots "
-    "(mean, worst capture) and of completely right frames in short simulated captures of several people, "
-    "labeled and tracked as by `handsim label` and `handsim track`, with measured but uncalibrated hands. "
-    "Joints: root mean square error over all joints, of uncalibrated hands; the section on joints is on "
-    "calibrated ones."
+    "count with the probability of other labels that the take itself states. Shares of right slots (mean, "
+    "worst capture) and of completely right frames in short simulated captures of several people, as by "
+    "`handsim label` and `handsim track`. Joints: root mean square error over all joints of measured but "
+    "uncalibrated hands; the section on joints is on calibrated ones."
 )
 _MOST_PAIRS: Final = 5  # number of listed pairs of similar labels
 
@@ -43,11 +42,9 @@ def write_glove_page(path: Path, score: LayoutScore) -> None:
         _markers_section(score),
         _joints_section(score),
     ]
-    network = (
-        "a labeler trained on it"
-        if score.is_trained
-        else "the network for any layout, after a minute of learning this one"
-    )
+    network = "a labeler trained on it"
+    if not score.is_trained:
+        network = "the network for any layout, after a minute of learning this one"
     lead = (
         f"{layout.num_markers} markers of {1e3 * layout.radius:.1f} mm, on {score.observed.num_frames:,} "
         f"frames of {score.seen_by}. Points were labeled by {network}."
@@ -111,10 +108,9 @@ def _captures_section(score: LayoutScore) -> Section:
 def _labels_section(score: LayoutScore) -> Section:
     columns = (score.observed, score.corrupted, score.clean)
     table = [["labels [%]", "as the rig sees them", "the paper's drops and ghosts", "every marker seen"]]
-    table += [
-        [title, *(percent_between(report.figures[name], report.interval(name)) for report in columns)]
-        for title, name in (("slots right", "slot_accuracy"), ("whole frames right", "frame_accuracy"))
-    ]
+    for title, name in (("slots right", "slot_accuracy"), ("whole frames right", "frame_accuracy")):
+        shares = (percent_between(report.figures[name], report.interval(name)) for report in columns)
+        table.append([title, *shares])
     accuracy, arrows = score.observed.slot_accuracy_by_marker, mistakes(score.observed.confusion)
     caption = f"{HAND_CAPTION}Arrows lead from true to given labels, wider for more points."
     people = score.observed.num_groups
@@ -138,9 +134,7 @@ def _markers_section(score: LayoutScore) -> Section:
 
 
 def _joints_section(score: LayoutScore) -> Section:
-    caption = (
-        "Markers are small rings, joints disks: the standard deviation of the worst angle there, in degrees."
-    )
+    caption = "Markers are small rings; disks show the standard deviation of the worst angle there [deg]."
     table = [["joints [deg]", "abduction", "first flexion", "second flexion", "last flexion"]]
     degrees = np.rad2deg(score.joints)
     rows = zip(DIGITS, degrees.reshape(len(DIGITS), -1), strict=True)

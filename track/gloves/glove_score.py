@@ -348,10 +348,8 @@ def try_take(truth: Take, layout: MarkerLayout, labeler: Labeler) -> Trial:
         slots[name], frames[name] = share.mean(axis=0), report.figures["frame_accuracy"]
         wrong.append(_wrong_throughout(layout.names, share, report) or _stated_alternatives(take))
     tracked = take  # by the last method
-    errors = [
-        (tracked.qpos[:, tracked.hand_index(hand.side), 7:] - truth.qpos[:, number, 7:]) ** 2
-        for number, hand in enumerate(truth.hands)
-    ]
+    order = [tracked.hand_index(hand.side) for hand in truth.hands]
+    errors = ((tracked.qpos[:, order, 7:] - truth.qpos[..., 7:]) ** 2).swapaxes(0, 1)
     size_error = abs(tracked.hands[0].shape.length - truth.hands[0].shape.length)
     of_methods = [min(1.0, sum(one.probability for one in every)) for every in wrong]
     return Trial(

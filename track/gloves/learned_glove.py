@@ -37,7 +37,7 @@ from track.frames import AnyCapture, capture_of
 from track.gloves.fit import FINE, FLESH, FittedPlaces, fit_places, shown_flesh
 from track.gloves.marker_search import FittedHand, diverse_frames, search_places
 from track.gloves.settings import LearnSettings
-from track.kinematics.pose_solver import PoseSolver
+from track.kinematics.pose_solver import OUTLIER_DISTANCE, PoseSolver
 from track.user import ATTACHMENT_ARRAYS, User
 
 _FIT_FRAMES: Final = 60  # number of frames of each capture to which hands and places are fitted
@@ -51,7 +51,6 @@ _TEMPERATURE: Final = 2.0  # Differences in energy are divided by this, because 
 _SAME_PLACE: Final = 0.015  # [m] A marker nearer to a place counts as there.
 _SURE_PROBABILITY: Final = 0.9  # A marker's place with a smaller probability is reported as doubtful.
 _EXAMINED_FRAMES: Final = 300  # number of frames in which exchanged columns are searched
-_OUTLIER_DISTANCE: Final = 0.01  # [m] robust scale of poses in that search
 # [m] In frames where a marker is farther from its place, columns may be exchanged.
 _BENT_DISTANCE: Final = 0.008
 _MOST_SUSPECTS: Final = 4  # number of tried markers, those with the largest distances in these frames
@@ -95,12 +94,8 @@ class LearnedGlove:
     def users(self) -> tuple[User, ...]:
         """A user for each capture: the hands in it, with their own places."""
         captures = sorted({one.capture for one in self.hands})
-        return tuple(
-            User(
-                tuple(one.hand for one in self.hands if one.capture == number), "learned from a labeled trial"
-            )
-            for number in captures
-        )
+        hands = (tuple(one.hand for one in self.hands if one.capture == number) for number in captures)
+        return tuple(User(some, "learned from a labeled trial") for some in hands)
 
 
 class _ColumnGroup(NamedTuple):
@@ -250,9 +245,8 @@ class _Learning:
         points = _right_points(one, own.names)
         points = points[diverse_frames(points, _FIT_FRAMES)]
         starts = [settle_glove(own, HandModel.named(size)) for size in _STARTS]
-        return min(
-            (fit_places(points, start, gain=FINE, flesh=flesh) for start in starts), key=lambda fit: fit.cost
-        )
+        fits = [fit_places(points, start, gain=FINE, flesh=flesh) for start in starts]
+        return min(fits, key=lambda fit: fit.cost)
 
 
 def _labeled(source: Capture, layout: MarkerLayout) -> Capture:
@@ -292,9 +286,8 @@ def held_out(source: Capture) -> Capture:
 
 def _with_markers(layout: MarkerLayout, names: Collection[str]) -> MarkerLayout:
     """The layout with some of its markers, for both hands."""
-    return dataclasses.replace(
-        layout, markers=tuple(one for one in layout.markers if one.name in names), sides=SIDES
-    )
+    kept = tuple(one for one in layout.markers if one.name in names)
+    return dataclasses.replace(layout, markers=kept, sides=SIDES)
 
 
 def _right_points(one: _HandColumns, names: Sequence[str]) -> Float[np.ndarray, "T M 3"]:
@@ -343,7 +336,7 @@ def _exchanges(one: _HandColumns, hand: GloveFit, source: Capture) -> Iterator[s
 
 def _squares(hand: GloveFit, points: Float[np.ndarray, "F M 3"]) -> Float[np.ndarray, "F M"]:
     """Squared distance of each point from its marker on the posed hand [m^2]; zero where missing."""
-    poses = PoseSolver(hand, outlier_distance=_OUTLIER_DISTANCE).solve(points)
+    poses = PoseSolver(hand, outlier_distance=OUTLIER_DISTANCE).solve(points)
     squares = ((points - hand.markers(poses.qpos)[0]) ** 2).sum(axis=2)
     return np.where(np.isfinite(squares), squares, 0.0)
 

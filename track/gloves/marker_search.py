@@ -126,10 +126,8 @@ class PlaceTable:
         self, places: Int[np.ndarray, "N"], names: Iterable[str], at: Float[np.ndarray, "N 3"] | None = None
     ) -> GloveFit:
         """A hand with markers at some places, or carried like these and `at` other points [m]."""
-        markers = tuple(
-            MarkerPlace(name, BONE_NAMES[self.bones[place]], 0.5, 0.0)
-            for name, place in zip(names, places, strict=True)
-        )
+        pairs = zip(names, places, strict=True)
+        markers = tuple(MarkerPlace(name, BONE_NAMES[self.bones[place]], 0.5, 0.0) for name, place in pairs)
         layout = MarkerLayout("learned", markers, self.radius)
         parts = (self.normals, self.bone_indices, self.bone_weights)
         points = self.points[places] if at is None else at
@@ -396,9 +394,8 @@ class _Search:
             yield slid
             if across == 0.0:
                 yield from (np.where(digits == digit, slid, places) for digit in np.unique(digits))
-        targets = [
-            np.where(digits >= 0, bones + 3 * (np.array(order)[digits] - digits), PALM) for order in orders
-        ]
+        shifts = [3 * (np.array(order)[digits] - digits) for order in orders]
+        targets = [np.where(digits >= 0, bones + shift, PALM) for shift in shifts]
         for digit, sign in itertools.product(range(count), (1, -1)):
             own = digits == digit
             aside = own & (sign * table.around[places] > _ASIDE_ANGLE)

@@ -27,7 +27,7 @@ class Proof(NamedTuple):
     frames: float
     """Share of the frames in which every label is right."""
     interval: tuple[float, float]
-    """95 % interval of this share; the frames of a second count once."""
+    """95 % interval of this share, in which the frames of one second [s] count once."""
     slots: float
     """Share of the markers in all frames that are right."""
     by_capture: tuple[float, ...]
@@ -80,9 +80,8 @@ def prove_glove(
         by_capture.append(float(right.mean()))
         slots.append(1.0 - float(wrong[:, list(columns.values())].mean()))
     shares = np.array([one.mean() for one in frames])
-    return Proof(
-        float(np.concatenate(frames).mean()), _interval(shares), float(np.mean(slots)), tuple(by_capture)
-    )
+    mean = float(np.concatenate(frames).mean())
+    return Proof(mean, _interval(shares), float(np.mean(slots)), tuple(by_capture))
 
 
 def _with_gaps(

@@ -37,6 +37,8 @@ from track.kinematics.marker_kinematics import (
 FEWEST_MARKERS: Final = 4  # A pose needs this many markers in a frame.
 FEWEST_ON_PART: Final = 3
 """This many markers determine a digit's joint angles, even if it is straight, or a palm's pose."""
+OUTLIER_DISTANCE: Final = 0.01
+"""Usual scale of the robust loss of poses [m]; labels farther from a robust fit are wrong."""
 RESTING: Final = np.tile(np.deg2rad([0.0, 25.0, 35.0, 20.0]), 5)  # joint angles of a relaxed hand [rad]
 # Six shapes of a digit [deg], in the order of its joints: relaxed, straight, half closed, bent in the knuckle
 # only, bent in all other joints, closed; for the thumb: relaxed, away from the palm, beside the index finger,
@@ -158,9 +160,8 @@ class PoseSolver:
     ) -> PoseFit:
         """Solve one frame in real time from a close start; a marker [m] is complete or NaN."""
         steps = self._robust_scale, _MOST_STEPS, _REAL_TIME_GAIN
-        return PoseFit(
-            *_fit_frames(self.hand, self._shapes, self.on_part, target[None], start[None], prior, *steps)
-        )
+        targets, starts = target[None], start[None]
+        return PoseFit(*_fit_frames(self.hand, self._shapes, self.on_part, targets, starts, prior, *steps))
 
     def marker_positions(self, qpos: Float[np.ndarray, "27"]) -> Float[np.ndarray, "M 3"]:
         """Positions of a pose's markers in the world [m]."""
@@ -202,9 +203,8 @@ def solve_pose(
             raise ArgumentError(f"initial has shape {initial.shape}, expected ({len(targets)}, {NUM_QPOS})")
         without = np.flatnonzero(~initial[:, 3:7].any(axis=1))
         if len(without):
-            raise ArgumentError(
-                f"initial has a quaternion of length zero in frame {without[0]}, expected an orientation"
-            )
+            reason = f"initial has a quaternion of length zero in frame {without[0]}"
+            raise ArgumentError(f"{reason}, expected an orientation")
     steps = _MOST_STEPS if iterations is None else iterations
     return PoseSolver(fit).solve(targets, initial, iterations=steps)
 

@@ -134,7 +134,7 @@ class HandDoubt(NamedTuple):
 
     noise: float  # of a marker around its place, independent in each frame [m]
     errors: HandErrors  # equal in all frames
-    places: Float[np.ndarray, "M 2"]  # of each marker on its bone: along the skin (each error), off it [m]
+    places: Float[np.ndarray, "M 2"]  # of each marker on its bone: along the skin (each way), off it [m]
     arch: Float[np.ndarray, "46 1"]  # arch of the palm as an error of the numbers, per flexion of each finger
     flesh: float = 0.0  # of a marker around its place, equal in successive frames [m]
 

@@ -33,8 +33,9 @@ from track.settings import TrackerSetup, TrackSettings
 from track.tracker import Tracker
 from track.user import MEASURED, User
 
-_FIRST_DURATION: Final = 0.3  # [s] duration of frames with enough points before the first measurement,
-_FINAL_DURATION: Final = 10.0  # [s] and before the final measurement
+_POINT_SHARE: Final = 0.8  # A frame has enough points if they suffice for this share of a hand's markers.
+_FIRST_DURATION: Final = 0.3  # [s] A hand is first measured after this time with enough points.
+_FINAL_DURATION: Final = 10.0  # [s] A hand is measured for the last time after this time with enough points.
 _LATER_FACTOR: Final = 2.0  # If no hand was found, the next measurement waits this many times as long.
 _LONGEST_STEP: Final = 0.1  # [s] A longer gap between two frames counts as this much time with hands.
 _MOST_FRAMES: Final = 20_000  # largest number of kept frames; a stream may show no hand for hours
@@ -134,7 +135,8 @@ class LiveSizing(Closing):
             self._seen_time, self._due, self._is_brief, self._is_done = 0.0, _FIRST_DURATION, True, False
             self._is_measured, self._reason, self._is_late = False, "", self._measuring is not None
         self._seen = frame.time if is_there else self._seen
-        if not self._is_done and len(frame.points) >= self._setup.fewest_points:
+        fewest = _POINT_SHARE * self._setup.user.layout.num_markers
+        if not self._is_done and len(frame.points) >= fewest:
             self._seen_time += min(frame.time - self._last, _LONGEST_STEP)
             self._last = frame.time
             self._frames.append(frame)

@@ -125,7 +125,7 @@ class LiveMessage:
     """A tracked frame as it is sent."""
 
     header: LiveHeader
-    """The same object in every message of a stream until the size of its hands changes."""
+    """Description of the stream: one object for all messages until the size of its hands changes."""
     number: int
     """Frame number; numbers of a stream may have gaps and may start again."""
     time: float
@@ -267,12 +267,8 @@ def in_axes(message: LiveMessage, axes: ProgramAxes) -> LiveMessage:
         )
         for hand in message.hands
     )
-    return dataclasses.replace(
-        message,
-        hands=tuple(hands),
-        bodies=tuple(map(placed, message.bodies)),
-        points=axes.positions(message.points),
-    )
+    bodies, points = tuple(map(placed, message.bodies)), axes.positions(message.points)
+    return dataclasses.replace(message, hands=tuple(hands), bodies=bodies, points=points)
 
 
 class MessageFormat(NamedTuple):

@@ -122,12 +122,8 @@ class Recorder(Closing):
         self._settings = {**settings_of(tracker), **settings}
         self._user = tracker.user
         sizes = {"H": len(tracker.hands), "B": len(tracker.bodies)}
-        self._archive = GrowingArchive(
-            growing_path(out),
-            self._header(None),
-            self._worn_arrays(),
-            [column.sized(sizes) for column in (*FRAMES, *POINTS, NUMBERS, *SPREADS, KEYPOINTS)],
-        )
+        columns = [column.sized(sizes) for column in (*FRAMES, *POINTS, NUMBERS, *SPREADS, KEYPOINTS)]
+        self._archive = GrowingArchive(growing_path(out), self._header(None), self._worn_arrays(), columns)
         self._times: tuple[float, float] | None = None
         self._closed = False
 

@@ -86,10 +86,8 @@ class WebSocketSink:
         """Pass a message on to the clients."""
         if self._socket.refused and not self._is_told:
             self._is_told = True
-            told = (
-                f"port {self.port} refuses further connections: {MOST_CONNECTIONS} are open, or no other file"
-            )
-            told += " may be opened; end receivers that are not needed"
+            limit = f"{MOST_CONNECTIONS} are open, or no other file may be opened"
+            told = f"port {self.port} refuses further connections: {limit}; end receivers that are not needed"
             warnings.warn(told, HandSimWarning, stacklevel=2)
         if message.header is not self._described:
             self._described, (self._header,) = message.header, self._format.header(message.header)

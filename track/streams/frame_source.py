@@ -152,9 +152,8 @@ class SourceStream(ArrivingFrames):
         try:
             self._source.close()
         except Exception as error:  # A user's source may raise anything; earlier frames are kept.
-            warnings.warn(
-                f"{self._name}: close failed ({type(error).__name__}: {error})", HandSimWarning, stacklevel=3
-            )
+            text = f"{self._name}: close failed ({type(error).__name__}: {error})"
+            warnings.warn(text, HandSimWarning, stacklevel=3)
 
     def close(self) -> None:
         """Close the source, and end the thread."""
@@ -172,9 +171,8 @@ class SourceStream(ArrivingFrames):
                     break
         except Exception as error:  # A user's source may raise anything.
             if not self._ended:  # A source closed while it waits may fail.
-                self.error = CaptureError(
-                    f"{self._name}: the stream failed ({type(error).__name__}: {error})"
-                )
+                text = f"{self._name}: the stream failed ({type(error).__name__}: {error})"
+                self.error = CaptureError(text)
                 self.error.__cause__ = error
         with self._changed:
             self._read_all = True

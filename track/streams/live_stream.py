@@ -47,8 +47,8 @@ _MOST_HELD: Final = 8  # largest number of frames held behind a gap
 _MOST_LEAD: Final = 16  # largest lead of a frame's time over its arrival [frames]
 _FEWEST_IN_A_ROW: Final = 5  # A jump is accepted after this many successive frames.
 _GAP_WAIT: Final = 0.03  # [s] longest time that a frame is held behind a gap
-_GAP_WAIT_FRAMES: Final = 5  # that time in frame intervals, for slower streams
-_LONGEST_WAIT: Final = 0.1  # [s] that time for disordered streams, and its bound for all
+_GAP_WAIT_FRAMES: Final = 5  # longest time behind a gap in slower streams [frames]
+_LONGEST_WAIT: Final = 0.1  # [s] longest time that any stream holds a frame; disordered streams use it
 _DISORDER_TIME: Final = 10.0  # [s] A stream counts as disordered for this time.
 _RESTART_AGE: Final = 1.0  # [s] A frame older than the last by more is from a restarted recording.
 _BURST_TIME: Final = 0.5  # [s] Late frames of a recording may arrive this long after the last one.
@@ -289,9 +289,8 @@ class LiveStream(Closing, Iterator[StreamedFrame]):
         """A frame that stands for a silence, with the current time."""
         now, last = time.monotonic(), self._last
         number, shown = (last.number, last.time + now - last.arrived) if last is not None else (0, 0.0)
-        return StreamedFrame(
-            number, shown, np.empty((0, 3)), np.empty(0, dtype=np.int64), silent=True, arrived=now
-        )
+        points, ids = np.empty((0, 3)), np.empty(0, dtype=np.int64)
+        return StreamedFrame(number, shown, points, ids, silent=True, arrived=now)
 
 
 class FrameOrder:
@@ -441,9 +440,8 @@ class FrameOrder:
     def _hold_confirmed(self, last: StreamedFrame, frame: StreamedFrame) -> None:
         """Hold frames of jumps that the stream's next frame confirms; drop old ones."""
         self._in_a_row = 0
-        right = [
-            one for one in self._jumping if last.time < one.time < frame.time and self._continues(one, frame)
-        ]
+        between = [one for one in self._jumping if last.time < one.time < frame.time]
+        right = [one for one in between if self._continues(one, frame)]
         for one in right:
             del self._jumping[one]
             self._hold(one)
@@ -564,9 +562,6 @@ def _increasing(ordered: list[StreamedFrame]) -> list[StreamedFrame]:
 
 def _usual_interval(ordered: list[StreamedFrame]) -> float | None:
     """Median time per frame number [s]; None if the numbers do not increase."""
-    intervals = [
-        (second.time - first.time) / (second.number - first.number)
-        for first, second in pairwise(ordered)
-        if second.number > first.number and second.time > first.time
-    ]
+    steps = [(second.time - first.time, second.number - first.number) for first, second in pairwise(ordered)]
+    intervals = [span / count for span, count in steps if count > 0 and span > 0.0]
     return float(np.median(intervals)) if intervals else None

@@ -507,9 +507,8 @@ def _join(info: ServerInfo, commands: socket.socket, url: str) -> socket.socket:
         )
     try:
         one = _bind(local if os.name == "nt" else group, info.data_port)
-        one.setsockopt(
-            socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, socket.inet_aton(group) + socket.inet_aton(local)
-        )
+        membership = socket.inet_aton(group) + socket.inet_aton(local)
+        one.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
     except OSError as error:
         raise CaptureError(f"{url}: cannot listen to {group} ({error.strerror or error})") from error
     return one

@@ -37,9 +37,7 @@ class QualisysSource:
     The ID of an identified marker is its index in QTM's list; other markers have QTM's IDs plus 65536.
     """
 
-    without_points = (
-        "in QTM switch on 3D tracking in real time: Project Options, Processing, Real-Time Actions"
-    )
+    without_points = "in QTM switch on real-time 3D tracking: Project Options, Processing, Real-Time Actions"
 
     def __init__(self, host: str, port: int = PORT) -> None:
         self._qtm: Any = import_extra("qtm_rt", "qtm://", "qualisys")

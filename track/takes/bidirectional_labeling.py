@@ -157,15 +157,10 @@ def _events_of(frames: Integers, one: Integers, other: Integers) -> _Events:
     order = np.lexsort((rows, pairs))
     follows = (np.diff(pairs[order]) == 0) & (np.diff(rows[order]) == 1)
     with_first, with_second = np.flatnonzero(first), np.flatnonzero(second)
-    _, mine, others = np.intersect1d(
-        rows[with_first] * span + first[with_first],
-        rows[with_second] * span + second[with_second],
-        assume_unique=True,
-        return_indices=True,
-    )
-    links = np.concatenate(
-        [[order[:-1][follows], order[1:][follows]], [with_first[mine], with_second[others]]], axis=1
-    )
+    keys = rows[with_first] * span + first[with_first], rows[with_second] * span + second[with_second]
+    _, mine, others = np.intersect1d(*keys, assume_unique=True, return_indices=True)
+    same, exchanged = [order[:-1][follows], order[1:][follows]], [with_first[mine], with_second[others]]
+    links = np.concatenate([same, exchanged], axis=1)
     return _Events(points, connected_components(links, len(rows)))
 
 

@@ -34,6 +34,7 @@ from track.kinematics.marker_kinematics import (
     marker_residuals,
     workspace,
 )
+from track.kinematics.pose_solver import OUTLIER_DISTANCE
 from track.kinematics.pose_spread import (
     SOURCES,
     SpreadModel,
@@ -62,7 +63,6 @@ _LEAST_FREEDOM: Final = 0.1  # lower bound of the share of marker coordinates th
 _LONGEST_STEP: Final = 0.5  # [rad], [m] bound of each step
 _FIRST_NOISE, _LEAST_NOISE = 0.0015, 0.0001  # [m] standard deviation of markers: first value, lower bound
 _ERROR_PER_BIAS: Final = 1.4  # ratio of a marker's place error to its mean residual, as poses absorb a part
-_OUTLIER_DISTANCE: Final = 0.01  # [m] scale of the robust loss (Geman and McClure 1987)
 # Permutations between a step's unknowns (joints, wrist position and rotation) and MuJoCo's order.
 _TO_MUJOCO: Final = np.r_[NUM_JOINTS:NUM_UNKNOWNS, 0:NUM_JOINTS]
 _FROM_MUJOCO: Final = np.argsort(_TO_MUJOCO)
@@ -297,7 +297,7 @@ class _SmoothedHand:
         """Normal matrices (F, 26, 26) and gradients (F, 26) of single frames."""
         qpos, prior = self.qpos[window.frames], self._prior
         normal, gradient, self._residuals[window.frames] = _frame_equations(
-            self._hand, self._targets[window.frames], qpos, self._weight_noise**-2, _OUTLIER_DISTANCE**-2
+            self._hand, self._targets[window.frames], qpos, self._weight_noise**-2, OUTLIER_DISTANCE**-2
         )
         markers = normal[::_COUNTED_STRIDE].copy()
         normal[:, :NUM_JOINTS, :NUM_JOINTS] += prior + self._known_precision
@@ -358,7 +358,7 @@ class _SmoothedHand:
 
 def _spread(values: Doubles) -> float:
     """Standard deviation of values around zero [m], without outliers."""
-    near = values[np.abs(values) < _OUTLIER_DISTANCE]
+    near = values[np.abs(values) < OUTLIER_DISTANCE]
     return float(np.sqrt(np.mean(near**2))) if len(near) else 0.0
 
 

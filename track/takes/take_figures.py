@@ -184,10 +184,9 @@ def wrist_figures(take: Take, hand: HandFigures, settings: PageSettings) -> Wris
     """The figures of a wrist whose forearm is among the bodies."""
     angles, number = take.wrist_angles(hand.side, settings.neutral), take.hand_index(hand.side)
     assert angles is not None
-    forearm, elbow = (
-        np.zeros(len(angles), bool) if body is None else take.body_status[:, body] >= INITIALIZED
-        for body in (take.forearm_index(hand.side), take.elbow_index(hand.side))
-    )
+    bodies = take.forearm_index(hand.side), take.elbow_index(hand.side)
+    status = [np.full(len(angles), LOST) if body is None else take.body_status[:, body] for body in bodies]
+    forearm, elbow = (one >= INITIALIZED for one in status)
     fitted = np.column_stack([hand.fitted & forearm, hand.fitted & forearm, elbow & forearm])
     spread = np.full(angles.shape, np.nan) if take.wrist_spread is None else take.wrist_spread[:, number]
     budget = np.full((angles.shape[1], len(SOURCES)), np.nan)

@@ -235,24 +235,22 @@ def _wrist_section(take: Take, hand: HandFigures, settings: PageSettings) -> Sec
             "Hand and forearm are never tracked together, or the axes of the forearm are unknown: "
             "<code>--neutral</code> gives them, as do landmarks (docs/angles.md).",
         )
-    told = np.flatnonzero(wrist.measured.any(axis=0))
+    shown = np.flatnonzero(wrist.measured.any(axis=0))
+    pronation = "that of the styloids against the epicondyles"
+    if len(shown) < len(WRIST_NAMES):
+        pronation = "unknown without markers at the elbow"
     text = (
-        "Angles of the ISB between forearm and third metacarpal (docs/angles.md): flexion counts positive, "
-        "extension negative; radial deviation positive, ulnar deviation negative. The band is one standard "
-        "deviation (SD) to either side; how well the axes of the forearm are known is not in it. SD constant "
-        "is the part of it that is the same in all frames. "
-    ) + (
-        "Pronation of the forearm is that of the styloids against the epicondyles."
-        if len(told) == len(WRIST_NAMES)
-        else "Pronation of the forearm is not told apart without markers at the elbow."
+        "ISB angles between forearm and third metacarpal (docs/angles.md): flexion and radial deviation "
+        "count positive, extension and ulnar deviation negative. The band is one standard deviation (SD) to "
+        "either side, without the uncertainty of the forearm's axes. SD constant: its part that is equal in "
+        f"all frames. Pronation of the forearm is {pronation}."
     )
     table = [["angle [deg]", *RANGE, "median SD", "SD constant", "measured [%]"]]
-    for number in told.tolist():
+    for number in shown.tolist():
         of = np.percentile(wrist.angles[wrist.measured[:, number], number], list(RANGE.values()))
-        cells = [*of, wrist.median_spreads()[number], wrist.constant[number]]
-        shown = [NOTHING if np.isnan(cell) else f"{cell:.1f}" for cell in cells]
+        numbers = [*of, wrist.median_spreads()[number], wrist.constant[number]]
         share = percent(float(wrist.measured[:, number].mean()))
-        table.append([WRIST_NAMES[number].replace("_", " "), *shown, share])
+        table.append([WRIST_NAMES[number].replace("_", " "), *map(_cell, numbers), share])
     curves = picture((9.6, 2.6), _draw_wrist, take.times, hand, wrist)
     return Section(title, text, pictures=[(curves, _SHADES)], table=table)
 
@@ -261,9 +259,9 @@ def _draw_wrist(figure: Figure, times: Doubles, hand: HandFigures, wrist: WristF
     panel = figure.subplots()
     _prepare_panel(panel, times, hand.status)
     panel.axhline(0.0, color=Paint.LINE, linewidth=0.8)
-    told = np.flatnonzero(wrist.measured.any(axis=0))
-    names = [WRIST_NAMES[number].split("_", 1)[1].replace("_", " ") for number in told.tolist()]
-    _draw_curves(panel, times, names, wrist.angles[:, told], wrist.spread[:, told])
+    shown = np.flatnonzero(wrist.measured.any(axis=0))
+    names = [WRIST_NAMES[number].split("_", 1)[1].replace("_", " ") for number in shown.tolist()]
+    _draw_curves(panel, times, names, wrist.angles[:, shown], wrist.spread[:, shown])
     panel.set_ylabel("wrist [deg]")
     panel.set_xlabel("time [s]")
 
@@ -272,19 +270,23 @@ def _range_section(title: str, take: Take, hand: HandFigures) -> Section:
     shares = "at its limits [%]", "measured [%]"
     table = [["joint [deg]", *RANGE, "median SD", "model's range", *shares, "longest gap [s]"]]
     for joint, (*first, limits, measured, gap) in zip(JOINTS, hand.joints().tolist(), strict=True):
-        cells = [NOTHING if np.isnan(one) else f"{one:.1f}" for one in first]
+        cells = [*map(_cell, first)]
         cells += [f"{joint.low_deg:g} to {joint.high_deg:g}", percent(limits) if limits > 0.0 else NOTHING]
         cells += [percent(measured), f"{gap / take.rate:.3f}" if gap else NOTHING]
         table.append([joint.name.replace("_", " "), *cells])
     text = (
-        "An angle is measured in a frame whose pose was fitted while a marker beyond the joint was seen, and "
+        "An angle is measured in frames whose pose was fitted while a marker beyond the joint was seen, and "
         f"predicted in all others. {int(hand.fitted.sum()):,} frames have a fitted pose. The range is that "
-        "of the measured frames; 5th and 95th are percentiles, which a single wrong frame does not change. "
-        "SD: standard deviation of the angle. A gap is a run of frames in which it is not measured, from the "
-        "hand's first pose to its last. At the limits of the model, which are soft by a few degrees, a joint "
-        "may bend further than the table says."
+        "of the measured frames; its percentiles ignore single wrong frames. SD: standard deviation of the "
+        "angle. A gap is a run of frames without a measured angle, between the hand's first pose and its "
+        "last. The limits of the model are soft by a few degrees; there a joint may bend further."
     )
     return Section(title, text, table=table)
+
+
+def _cell(value: float, decimals: int = 1) -> str:
+    """A number of a table; a dash for NaN."""
+    return NOTHING if np.isnan(value) else f"{value:.{decimals}f}"
 
 
 def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -> Section:
@@ -297,16 +299,16 @@ def _error_section(title: str, settings: Mapping[str, Any], hand: HandFigures) -
     text = (
         "Filter: all poses were solved together, forward and backward in time, without a delay. It acts as a "
         "Butterworth filter of second order that runs forward and backward: at the cut-off an oscillation "
-        "keeps half of its size. SD [deg]: standard deviation of the angle, the root of the sum of the "
-        "squares of its five parts, each as root mean square over all frames. Gluing is a constant error, as "
-        "is what stays of the person: sizes and directions of bones, and gestures unlike other people's. "
-        "Palm: the metacarpals of ring and little finger flex as these bend, which the model takes for "
-        "motion of their MCP joints; none in the flat hand. SEM: standard error of measurement of the angle "
-        "in a frame between sessions of a person, with the glove put on anew: the other four parts of hands "
-        f"that are calibrated in each session, of other hands {' and '.join(changing)}, and {palm}. MDD: "
-        "minimal detectable difference of two sessions, 1.96 times the root of two times "
-        "the SEM, of the angle in a frame, of its mean, of its 5th or 95th percentile (peak), and of its "
-        "range of motion between these, each with a SEM of its own."
+        "keeps half of its size. SD [deg]: standard deviation of the angle, the root of the sum of its five "
+        "squared parts, each as root mean square over all frames. Gluing and person are constant errors; "
+        "person: sizes and directions of bones, and gestures unlike other people's. Palm: the metacarpals of "
+        "ring and little finger flex with these, which the model takes for motion of their MCP joints; zero "
+        "in a flat hand. SEM: standard error of measurement of the angle in a frame between sessions of a "
+        "person, with the glove put on again: the other four parts of hands that are calibrated in each "
+        f"session, of other hands {' and '.join(changing)}, and {palm}. MDD: minimal detectable "
+        "difference of two sessions, 1.96 times the root of two times the SEM; of the angle in a frame, its "
+        "mean, its 5th or 95th percentile (peak), and its range of motion between these, each with its own "
+        "SEM."
     )
     table = [["joint", "SD", *SOURCES, "SEM", *(f"MDD, {one}" for one in CHANGING), "cut-off [Hz]"]]
     for joint, cells in zip(JOINTS, errors.tolist(), strict=True):
@@ -319,17 +321,14 @@ def _markers_section(title: str, take: Take, hand: HandFigures) -> Section:
     table = [[*header, "confidence: median [%]"]]
     for marker in hand.markers():
         longest = f"{marker.longest_gap / take.rate:.3f}" if marker.num_gaps else NOTHING
-        residuals = [
-            NOTHING if np.isnan(one) else f"{1e3 * one:.2f}"
-            for one in (marker.median_residual, marker.high_residual)
-        ]
+        residuals = [_cell(1e3 * one, 2) for one in (marker.median_residual, marker.high_residual)]
         first = [marker.name, percent(marker.seen), f"{marker.num_gaps:,}", longest]
         table.append([*first, *residuals, percent(marker.median_confidence)])
     drawn = picture((9.6, 1.0 + 0.17 * len(hand.marker_names)), _draw_presence, take.times, hand)
     text = (
         "Seen: the share of all frames in which a point has the marker's label. A gap is a run of frames "
-        "without it, from the hand's first pose to its last. Residual: how far the point is from the marker "
-        "of the pose."
+        "without it, between the hand's first pose and its last. Residual: distance of the point from the "
+        "pose's marker."
     )
     caption = "Blue where the marker was seen; pale where it was seen in some of the frames of a column."
     return Section(title, text, pictures=[(drawn, caption)], table=table)
@@ -418,10 +417,9 @@ def _spans_section(take: Take, spans: Sequence[SuspectSpan], source: str) -> Sec
     vouched = vouch(take, spans)
     text = (
         f"{len(spans):,} rows; {100 * vouched.listed:.1f} % of the frames have doubtful labels. Faults of "
-        "the take come first, then spans in which a label is probably wrong or a marker lacks its own, those "
-        "with the most such frames first; the percentage is the least confidence in a point. "
-        f"<code>{escape(command)}</code> lists the first of them too; a click leads there, "
-        "and a wrong label can be corrected."
+        "the take come first, then spans in which a label is probably wrong or missing, those with the most "
+        "such frames first; the percentage is the least confidence in a point. "
+        f"<code>{escape(command)}</code> lists the first of them, leads to their frames, and corrects labels."
     )
     more = f"These are the first {_MOST_SPANS} of {len(spans):,}; the table beside the page has all."
     if take.made_by_tracker and (looks := vouched.looks(_WANTED)):

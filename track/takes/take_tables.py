@@ -161,10 +161,8 @@ def _cycle_rows(take: Take, hands: Sequence[HandFigures], cycles: Sequence[Cycle
     for hand, found in zip(hands, cycles, strict=True):
         starts = take.times[[span[0] for span in found.spans]]
         numbers = np.concatenate([found.figures, found.curves], axis=2)
-        every = [
-            (f"{n + 1}", _time(start), one)
-            for n, (start, one) in enumerate(zip(starts, numbers, strict=True))
-        ]
+        rows_of = enumerate(zip(starts, numbers, strict=True), 1)
+        every = [(f"{number}", _time(start), one) for number, (start, one) in rows_of]
         every += [(name, "", one) for name, one in mean_and_spread(numbers)] if every else []
         for name, start, joints in every:
             for joint, values in zip(JOINT_NAMES, joints.tolist(), strict=True):

@@ -89,9 +89,8 @@ class Corrector:
                 within = (points.frames >= first) & (points.frames <= last)
                 same = np.flatnonzero((points.ids == points.ids[point]) & within)
                 if not len(same):
-                    raise CaptureError(
-                        f"the point is not there in frames {first} to {last}, expected a frame with it"
-                    )
+                    where = f"frames {first} to {last}"
+                    raise CaptureError(f"the point is not there in {where}, expected a frame with it")
                 point = int(same[0])
                 start, last = points.frames[same[[0, -1]]].tolist()
             x, y, z = points.points[point].tolist()

@@ -60,9 +60,8 @@ def set_stage(
     # Soft light preserves the colors of labels.
     scene.configure_default_lights(enabled=False)
     scene.configure_environment_map("studio", environment_intensity=0.12)
-    scene.add_light_hemisphere(
-        "/light/sky", sky_color=(255, 255, 255), ground_color=(150, 140, 130), intensity=0.55
-    )
+    sky, floor = (255, 255, 255), (150, 140, 130)
+    scene.add_light_hemisphere("/light/sky", sky_color=sky, ground_color=floor, intensity=0.55)
     for name, intensity, place in (("key", 1.3, (1.5, -1.0, 2.5)), ("fill", 0.3, (-2.0, 1.5, 1.0))):
         x, y, z = (turn @ place).tolist()
         scene.add_light_directional(f"/light/{name}", intensity=intensity, position=(x, y, z))
@@ -114,13 +113,8 @@ def show_volume(server: ViserServer, rig: CameraRig) -> None:
     server.scene.add_box("/volume", (40, 120, 60), (side, side, side), wireframe=True, position=ROOM_CENTER)
     places, counts = camera_counts(rig)
     share = (counts / len(rig.positions))[:, None]
-    server.scene.add_point_cloud(
-        "/coverage",
-        points=places,
-        colors=np.round((1.0 - share) * _FEW_CAMERAS_COLOR + share * _ALL_CAMERAS_COLOR).astype(np.uint8),
-        point_size=0.012,
-        point_shape="circle",
-    )
+    colors = np.round((1.0 - share) * _FEW_CAMERAS_COLOR + share * _ALL_CAMERAS_COLOR).astype(np.uint8)
+    server.scene.add_point_cloud("/coverage", places, colors, point_size=0.012, point_shape="circle")
 
 
 def camera_counts(rig: CameraRig) -> tuple[Doubles, Integers]:
@@ -280,9 +274,8 @@ class FrameView:
                 self.bodies.append(server.scene.add_frame(name, axes_length=0.05, axes_radius=0.002))
             else:
                 surface = thing.vertices, thing.faces
-                self.bodies.append(
-                    server.scene.add_mesh_simple(name, *surface, color=_BODY_COLOR, opacity=0.6)
-                )
+                mesh = server.scene.add_mesh_simple(name, *surface, color=_BODY_COLOR, opacity=0.6)
+                self.bodies.append(mesh)
         self._clicked: frozenset[int] = frozenset()
         self._kept = np.empty(0, dtype=np.int64)  # indices of the shown points in the frame
         self.on_pick: Callable[[int], None] = lambda index: None

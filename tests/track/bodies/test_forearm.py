@@ -244,7 +244,7 @@ def test_pronation_is_not_told_without_an_elbow(tmp_path):
     assert np.isnan(take.wrist_spread[..., 2]).all() and len(take.settings["wrist_budget"]["right"]) == 2
     write_take_page(tmp_path / "page.html", take, settings=PageSettings())
     page = (tmp_path / "page.html").read_text()
-    assert "not told apart without markers at the elbow" in page and "wrist flexion" in page
+    assert "unknown without markers at the elbow" in page and "wrist flexion" in page
     assert "forearm pronation" not in page
 
 

@@ -20,7 +20,7 @@ from track.gloves.glove_score import (
     METHODS,
     NOISE,
     SIDES_EXCHANGED,
-    _counted,
+    _count_right,
     _wrong_throughout,
     free_spreads,
     joint_spreads,
@@ -215,7 +215,7 @@ def trial_of(count):
 
 def right_shares(truth, take):
     """Share of the frames in which each marker of the true hands is right, and share of right frames."""
-    share, report = _counted(truth, take)
+    share, report = _count_right(truth, take)
     return share.mean(axis=0), report.figures["frame_accuracy"]
 
 
@@ -280,12 +280,12 @@ def exchanged(take, pairs, *, share=1.0):
 def test_what_is_wrong_throughout_a_capture_is_named(pairs, words, markers):
     truth = simulate_take("single-hand", glove="dense19", num_frames=40, seed=1)
     names = truth.hands[0].layout.names
-    found = _wrong_throughout(names, *_counted(truth, exchanged(truth, pairs, share=0.8)))
+    found = _wrong_throughout(names, *_count_right(truth, exchanged(truth, pairs, share=0.8)))
     assert sorted(one.words for one in found) == sorted(one.format(*names) for one in words)
     assert {one.markers for one in found} == {tuple(sorted(one)) for one in markers} and all(
         one.probability == 1.0 for one in found
     )
-    assert not _wrong_throughout(names, *_counted(truth, exchanged(truth, pairs, share=0.3)))
+    assert not _wrong_throughout(names, *_count_right(truth, exchanged(truth, pairs, share=0.3)))
 
 
 @pytest.mark.parametrize("wrong", [[0.0] * 9, [1.0, *[0.0] * 8], [0.5, *[0.02] * 11], [1.0] * 9])

@@ -437,7 +437,7 @@ def test_a_quiet_server_is_greeted_anew(monkeypatch):
     with Puppet(unicast((4, 1))) as server:
         stream = open_stream(server.url)
         for heard in (2, 4, 6):
-            stream._heard = 0.0  # long ago
+            stream._framed_at = 0.0  # long ago
             now[0] += 0.11
             wait_for(lambda heard=heard: len(server.heard) == 1 + heard)
             server.say(natnet.pack(Kind.KEEP_ALIVE))  # good, but no frame
@@ -491,14 +491,14 @@ def test_a_server_that_comes_back_with_another_group_and_port_is_heard(monkeypat
             assert frames(stream) == [0]
             for number in (1, 0):  # and back again
                 server._answers = [natnet.pack_server_info(infos[number])]
-                stream._heard = 0.0  # long ago
+                stream._framed_at = 0.0  # long ago
                 wait_for(lambda number=number: (stream.poll(0.01), stream._joined == infos[number])[1])
                 senders[number].sendto(
                     frame(5 + number, (4, 1)), (infos[number].group, infos[number].data_port)
                 )
                 assert frames(stream) == [5 + number]
             server._answers = [natnet.pack_server_info(unicast((4, 1)))]
-            stream._heard = 0.0
+            stream._framed_at = 0.0
             wait_for(lambda: (stream.poll(0.01), len(stream._sockets) == 1)[1])
             server.say(frame(9, (4, 1)))
             assert frames(stream) == [9]

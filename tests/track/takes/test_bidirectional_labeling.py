@@ -8,7 +8,7 @@ import numpy as np
 
 from gloves import PointList
 from gloves.takes.take import LOST, TRACKED
-from track.takes.bidirectional_labeling import _events_of, _exchanges, _is_likelier
+from track.takes.bidirectional_labeling import _events_of, _exchanged_runs, _is_likelier
 
 
 def test_runs_of_exchanged_hands_are_found():
@@ -17,8 +17,8 @@ def test_runs_of_exchanged_hands_are_found():
     forward = np.array([right, right, right, right, gap, right])
     backward = np.array([right, left, left, digit, left, left])
     points = PointList.of_tables(np.zeros((6, 5, 3)), forward, forward, np.ones((6, 5)))
-    assert list(_exchanges(points, forward.ravel(), backward.ravel(), 5)) == [slice(1, 3), slice(5, 6)]
-    assert list(_exchanges(points, forward.ravel(), forward.ravel(), 5)) == []
+    assert list(_exchanged_runs(points, forward.ravel(), backward.ravel(), 5)) == [slice(1, 3), slice(5, 6)]
+    assert list(_exchanged_runs(points, forward.ravel(), forward.ravel(), 5)) == []
 
 
 def test_labels_that_change_together_are_one_event():
