@@ -15,6 +15,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from gloves.optics.visibility import free_rays
+from gloves.takes.take import Take
+from handsim.hand.model import hand_keypoints
 from handsim.kernels import kernel, segment_distance_squared
 from handsim.space.camera import Camera
 from render.frames import Doubles, Integers
@@ -25,6 +28,8 @@ _INNER: Final = 0.035  # distance of an arm's axis from a line of sight that it 
 _OUTER: Final = 0.075  # least distance of one that it leaves free [m]
 HIDING: Final = 15.0
 """Cost of an arm that hides all keypoints from a camera."""
+MOST_HIDDEN: Final = 0.4
+"""A picture shows a hand if less than this share of its keypoints is hidden."""
 _COMPARED: Final = 10  # forearms whose upper arms are tried
 _STEADY: Final = 2.0  # cost of an arm that turns by 60 degrees between two choices
 _TURNS: Final = np.deg2rad([0, 20, -20, 40, -40, 60, -60, 90, -90, 120, -120, 150, -150, 180])
@@ -135,17 +140,57 @@ def hiding_costs(
     return costs
 
 
+class SeenHands:
+    """Keypoints of the hands of some frames, and what is before them."""
+
+    def __init__(self, take: Take, frames: Integers) -> None:
+        there = np.isfinite(take.qpos[frames]).all(axis=2)
+        qpos = np.where(there[..., None], take.qpos[frames], np.eye(take.qpos.shape[2])[3])
+        self.points: Doubles = np.empty((*there.shape, 21, 3))
+        """Positions (F, H, 21, 3) [m]; NaN where a hand is absent."""
+        self._flesh = []
+        for number, hand in enumerate(take.hands):
+            poses, capsules = np.ascontiguousarray(qpos[:, number]), hand.model.capsules
+            self.points[:, number] = hand_keypoints(hand.model, poses)
+            self._flesh.append((capsules.posed(hand.model.forward_kinematics(poses)), capsules.radii))
+            self._flesh[number][0][~there[:, number]] = np.nan
+        self.points[~there] = np.nan
+
+    def most_hidden(self, axes: Float[np.ndarray, "F A 2 3"], eyes: Float[np.ndarray, "F C 3"]) -> Doubles:
+        """Share (F, C) of a hand's keypoints that arms and the other hand hide, of the more hidden hand."""
+        behind = np.zeros((*eyes.shape[:2], *self.points.shape[1:3]))
+        for camera, eye in enumerate(np.swapaxes(eyes, 0, 1)[..., None, :]):
+            for one, other in ((0, 1), (1, 0)) if len(self._flesh) == 2 else ():
+                (axis, radii), lines = self._flesh[other], self.points[:, one] - eye
+                free = free_rays(lines, np.zeros((1, 3)), axis - eye[:, None], radii)
+                behind[:, camera, one] = ~free[..., 0]
+        rows = np.repeat(np.arange(len(eyes)), eyes.shape[1])
+        places = (
+            axes[rows],
+            eyes.reshape(-1, 3),
+            self.points[rows],
+            behind.reshape(len(rows), *behind.shape[2:]),
+        )
+        return np.asarray(most_hidden(*map(np.ascontiguousarray, places)).reshape(eyes.shape[:2]))
+
+
 @kernel
 def most_hidden(
-    axes: Float[np.ndarray, "F A 2 3"], eyes: Float[np.ndarray, "F 3"], points: Float[np.ndarray, "F H P 3"]
+    axes: Float[np.ndarray, "F A 2 3"],
+    eyes: Float[np.ndarray, "F 3"],
+    points: Float[np.ndarray, "F H P 3"],
+    behind: Float[np.ndarray, "F H P"],
 ) -> Any:
-    """Share (F,) of the points of a hand that arms hide, of the hand with the largest; NaN is no hand."""
+    """Share (F,) of the points of a hand that arms hide, of the hand with the largest; NaN is no hand.
+
+    Points `behind` something else (1) are hidden whatever the arms do.
+    """
     most = np.zeros(len(eyes))
     for frame in range(len(eyes)):
-        for hand in points[frame]:
+        for hand in range(points.shape[1]):
             hidden = 0.0
-            for point in hand:
-                covered = 0.0
+            for number in range(points.shape[2]):
+                point, covered = points[frame, hand, number], behind[frame, hand, number]
                 for arm in range(axes.shape[1]):
                     start, end = axes[frame, arm, 0], axes[frame, arm, 1]
                     covers = 1.0 if _is_close(eyes[frame], start, end) else 0.0

@@ -123,7 +123,8 @@ class Drawing:
         self.take, rng = self.subject.take, SpawnKey.VIEWPOINTS.rng(config.seed)
         # Single poses may be of many people; only cameras at the eyes need one person nevertheless.
         has_user = subject.is_motion or config.view.placement == "head"
-        self._user = UserBody(self.take, known_positions(config.view, config.up)) if has_user else None
+        known, sees = known_positions(config.view, config.up), config.view.placement == "head"
+        self._user = UserBody(self.take, known, sees=sees) if has_user else None
         poses = None if subject.footage is None else subject.footage.poses
         self.viewpoints = Viewpoints(
             config.view, self.take, rng=rng, up=config.up, user=self._user, poses=poses

@@ -8,7 +8,7 @@ Drillis and Contini (1966), Body segment parameters, over that of the hand.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 import numpy as np
@@ -21,14 +21,14 @@ from handsim.space.transforms import quaternion_matrix
 from render.arms import (
     HIDING,
     Arms,
+    SeenHands,
     bend_arms,
     bending_costs,
     forearm_axes,
     hiding_costs,
-    most_hidden,
     turning,
 )
-from render.frames import Doubles
+from render.frames import Doubles, Integers
 from render.skin.look import ELBOW, REACH, Forearm
 
 _HAND: Final = 0.108  # length of a hand, as a share of the stature
@@ -99,8 +99,13 @@ class UserBody:
     forearms: Doubles
     """Unit directions from wrists to elbows in all frames (T, H, 3); NaN where there is no hand."""
 
-    def __init__(self, take: Take, cameras: Float[np.ndarray, "C 3"] | None = None) -> None:
-        """Place the person where no hand is hidden from the eyes, nor from cameras at these positions [m]."""
+    def __init__(
+        self, take: Take, cameras: Float[np.ndarray, "C 3"] | None = None, *, sees: bool = False
+    ) -> None:
+        """Place the person where no hand is hidden from the eyes, nor from cameras at these positions [m].
+
+        Arms count as obstacles before eyes that a camera `sees` from; they give way to others.
+        """
         self._cameras: Doubles = np.empty((0, 3)) if cameras is None else cameras
         self._lengths = np.array([hand.shape.length for hand in take.hands])
         self.mirrors = np.array([-1.0 if hand.side == "left" else 1.0 for hand in take.hands])
@@ -109,32 +114,72 @@ class UserBody:
         wrists, axes = take.qpos[frames, :, :3], quaternion_matrix(take.qpos[frames, :, 3:7])
         palms = self._palms(wrists, axes)
         middle = _middle(palms.reshape(-1, 3))
-        outlines = np.stack([wrists, palms, 2.0 * palms - wrists], axis=2)
-        best, azimuth = np.inf, 0.0
+        self._tracked = _tracked_forearms(take)
+        others = np.broadcast_to(self._cameras, (len(frames), *self._cameras.shape))
+        best, azimuth, seen = np.inf, 0.0, SeenHands(take, frames)
         for azimuths, distances, downs, facings in (_COARSE, _FINE):
             grids = np.meshgrid(azimuth + azimuths, distances, downs, facings)
             tried = np.stack([grid.ravel() for grid in grids], axis=1)
             eyes, neck, right = self._stand(middle, *tried.T)
             shoulders, trunk = self._shoulders(neck, right), self._trunk(neck, right)
-            _, costs = self._elbows(wrists, axes, shoulders[:, None], eyes[:, None])
+            ways, costs = self._elbows(wrists, axes, shoulders[:, None], eyes[:, None])
             means = np.nanmean(np.minimum(costs.min(axis=-1), _WORST * (1 + len(self._cameras))), axis=(1, 2))
-            means += _blocking(trunk[:, : len(_TRUNK)], eyes[:, None], outlines)
-            means += _blocking(trunk, self._cameras[None], outlines)
             means += _UNUSUAL * np.square((tried[:, 1:] - _NATURAL) / _SPREADS).sum(axis=1)
+            ways = np.take_along_axis(ways, costs.argmin(axis=-1)[..., None, None], axis=3)[..., 0, :]
+            elbows = self._elbows_of(wrists, ways)
+            for row, eye in enumerate(eyes):
+                body = _axes(wrists, elbows[row], shoulders[row], trunk[row])
+                near = body[:, 0 if sees else -trunk.shape[1] : -len(_HEAD)]
+                own = seen.most_hidden(near, np.broadcast_to(eye, (len(frames), 1, 3)))
+                behind = seen.most_hidden(body[:, -trunk.shape[1] :], others).sum()
+                means[row] += (
+                    HIDING * ((np.minimum(2.0 * own, 1.0) if sees else own).sum() + behind) / len(frames)
+                )
             first = int(means.argmin())
             if means[first] < best:
                 best, azimuth = float(means[first]), float(tried[first, 0])
                 self.eyes, self.shoulders, self.right = eyes[first], shoulders[first], right[first]
                 self.trunk, self.neck = trunk[first], neck[first]
-        self._tracked = _tracked_forearms(take)
         self.forearms = _where_known(self._tracked, self._forearms(take.qpos))
 
     def axes(self, wrists: Float[np.ndarray, "T H 3"], forearms: Float[np.ndarray, "T H 3"]) -> Doubles:
         """Axes (T, 2 H + B, 2, 3) of forearms in these directions, of upper arms, and of the trunk [m]."""
-        elbows = self._elbows_of(wrists, forearms)
-        upper = np.stack(np.broadcast_arrays(elbows, self.shoulders), axis=-2)
-        trunk = np.broadcast_to(self.trunk, (len(wrists), *self.trunk.shape))
-        return np.concatenate([forearm_axes(wrists, elbows), upper, trunk], axis=1)
+        return _axes(wrists, self._elbows_of(wrists, forearms), self.shoulders, self.trunk)
+
+    def hidden(
+        self,
+        take: Take,
+        seen: SeenHands,
+        frames: Integers,
+        trials: Iterable[Sequence[Sequence[Camera]]],
+    ) -> list[Doubles]:
+        """Share (F, C) of a hand's keypoints that each trial's cameras do not see, of the more hidden hand.
+
+        A trial has C cameras in each of F frames, which are in the head, and to which arms give way.
+        """
+        (arms, points, hands), wrists = self._arms_of(take, frames, whole=False), take.qpos[frames, :, :3]
+        shares, ways = [], np.full((2, *wrists.shape), np.nan)
+        for cameras in trials:
+            ways[:, :, hands] = bend_arms(arms, points, cameras)
+            elbows = self._elbows_of(wrists, ways[0])
+            axes = _axes(wrists, elbows, elbows + ways[1], self.trunk[: len(_TRUNK)])
+            eyes = np.array([[one.T_world_camera[:3, 3] for one in viewing] for viewing in cameras])
+            shares.append(seen.most_hidden(axes, eyes))
+        return shares
+
+    def _arms_of(self, take: Take, frames: Integers, *, whole: bool) -> tuple[Arms, Doubles, list[int]]:
+        """Where arms can be in these frames, keypoints (K, N, 3) [m], and the hands that ever come.
+
+        Hands that are away wait at the nearest place where they are.
+        """
+        present = np.isfinite(take.qpos).all(axis=2)
+        qpos, points, hands = take.qpos[frames], list[Doubles](), np.flatnonzero(present.any(axis=0)).tolist()
+        for number in hands:
+            there = np.flatnonzero(present[:, number])
+            nearest = np.rint(np.interp(frames, there, np.arange(len(there)))).astype(int)
+            qpos[:, number] = take.qpos[there[nearest], number]
+            points.append(hand_keypoints(take.hands[number].model, qpos[:, number]))
+        return self.arms(qpos, hands, frames, whole=whole), np.concatenate(points, axis=1), hands
 
     def arms(
         self,
@@ -159,23 +204,14 @@ class UserBody:
     ) -> tuple[Doubles, Doubles]:
         """Unit directions of forearms, and upper arms [m], (T, H, 3) each, in all frames of a motion.
 
-        They are bent for cameras, and end at the shoulders if they are whole. Hands that are away wait at the
-        nearest place where they are; those that never come have NaN.
+        They are bent for cameras, and end at the shoulders if they are whole. Hands that never come have NaN.
         """
-        step = max(1, round(_CHOSEN * take.rate))
-        frames, present = np.arange(0, take.num_frames, step), np.isfinite(take.qpos).all(axis=2)
-        qpos, points, hands = take.qpos[frames], list[Doubles](), np.flatnonzero(present.any(axis=0)).tolist()
-        for number in hands:
-            there = np.flatnonzero(present[:, number])
-            nearest = np.rint(np.interp(frames, there, np.arange(len(there)))).astype(int)
-            qpos[:, number] = take.qpos[there[nearest], number]
-            points.append(hand_keypoints(take.hands[number].model, qpos[:, number]))
-        chosen = []
+        step, chosen = max(1, round(_CHOSEN * take.rate)), []
+        frames = np.arange(0, take.num_frames, step)
         for first in range(0, len(frames), _CHUNK):
-            some = slice(first, first + _CHUNK)
-            seen = np.concatenate([one[some] for one in points], axis=1)
-            arms = self.arms(qpos[some], hands, frames[some], whole=whole)
-            chosen.append(bend_arms(arms, seen, [*map(cameras, frames[some].tolist())]))
+            some = frames[first : first + _CHUNK]
+            arms, points, hands = self._arms_of(take, some, whole=whole)
+            chosen.append(bend_arms(arms, points, [*map(cameras, some.tolist())]))
         fore, upper = np.full((2, take.num_frames, len(take.hands), 3), np.nan)
         for directions, ways in zip((fore, upper), zip(*chosen, strict=True), strict=True):
             directions[:, hands] = turning(np.concatenate(ways), step, take.num_frames)
@@ -315,13 +351,11 @@ def _directions(right: Doubles) -> Doubles:
     return np.stack([right, np.cross(up, right), up], axis=-2)
 
 
-def _blocking(trunks: Doubles, eyes: Doubles, points: Doubles) -> Doubles:
-    """Costs (K,) of trunks (K, B, 2, 3) that hide points (F, H, P, 3) of hands from eyes (K or 1, C, 3)."""
-    shape = (len(trunks), len(points), eyes.shape[1])
-    views = (trunks[:, None, None], eyes[:, None], points[None, :, None])
-    each = [np.broadcast_to(one, (*shape, *one.shape[3:])) for one in views]
-    hidden = most_hidden(*(np.array(one, order="C").reshape(-1, *one.shape[3:]) for one in each))
-    return np.asarray(HIDING * hidden.reshape(shape).sum(axis=2).mean(axis=1))
+def _axes(wrists: Doubles, elbows: Doubles, shoulders: Doubles, trunk: Doubles) -> Doubles:
+    """Axes (T, 2 H + B, 2, 3) of forearms, upper arms, and of a trunk and a head [m]."""
+    upper = np.stack(np.broadcast_arrays(elbows, shoulders), axis=-2)
+    body = np.broadcast_to(trunk, (len(wrists), *trunk.shape))
+    return np.concatenate([forearm_axes(wrists, elbows), upper, body], axis=1)
 
 
 def _tracked_forearms(take: Take) -> Doubles:

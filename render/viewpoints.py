@@ -7,6 +7,7 @@ alone.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ from handsim.space.camera import Camera, look_at, preset
 from handsim.space.rig import load_rig
 from handsim.space.rig_formats import load_cameras
 from handsim.space.transforms import UpAxis, quaternion_matrix, rigid, room_axes
-from render.arms import most_hidden
+from render.arms import MOST_HIDDEN, SeenHands
 from render.frames import Doubles, Flags, Floats, Integers
 from render.user_body import UserBody
 
@@ -37,8 +38,9 @@ _BORDER: Final = 0.04  # border of a picture that hands keep free, as a share of
 _NEAREST_KEYPOINT: Final = 0.15  # least depth of a keypoint before a camera [m]
 _WIDEST_TANGENT: Final = 2.0  # largest tangent of half an angle of view that hands may fill
 _MOUNTED: Final = 0.03  # largest distance of a head's camera from the eyes along each axis [m]
-_HEAD_SEEN_SHARE: Final = 0.92  # share of the frames in which a head that leans back sees all hands
-_LEAN: Final = 0.3  # largest distance by which a head leans back [m]
+_LEANS: Final = np.array([*itertools.product((0.0, 0.1, 0.2, 0.3), (0.0, -0.1, 0.1), (0.0, 0.08))])
+"""Distances [m] that a head is moved by: back, to the right, and upwards."""
+_EFFORT: Final = 0.3  # share of pictures with free hands that a head is moved a meter for
 _ORBIT_PERIOD: Final = 12.0  # time of one revolution of a camera in orbit [s]
 _TRIES: Final = 60  # random directions that are tried for one camera
 _CLOSER: Final = 1.35  # largest ratio between a hand's share and `ViewConfig.share`
@@ -52,8 +54,6 @@ _SAMPLES: Final = 48  # frames in which they are compared
 _CENTERINGS: Final = 2  # times that a camera is turned to the middle of what it sees
 _LINGER: Final = 20.0  # exponent of the hands' share in the time that an orbit spends on a view
 _QUICKEST: Final = 0.02  # shortest time at an azimuth of an orbit, as a share of the longest
-_MOST_HIDDEN_SHARE: Final = 0.4
-"""A picture shows a hand if arms hide less than this share of its keypoints."""
 _CLEAR_SHARE: Final = 0.97  # Other places are tried until this share of the pictures shows all hands.
 _GIVES_WAY: Final = 3.0  # power of that share that outweighs the size of the hands
 _ASIDE: Final = np.deg2rad(90.0)  # largest angle that is added to the usual one from the front
@@ -88,7 +88,11 @@ class Framing:
         self._there = np.isfinite(self.points[..., 0, 0])
         self.trunk: Doubles = np.empty((0, 3)) if user is None else user.trunk.reshape(-1, 3)
         """Positions (N, 3) of the person's trunk and head [m]; none of nobody."""
-        self._arms = None if user is None else user.axes(take.qpos[..., :3], user.forearms)
+        self.sampled: Integers = np.unique(np.linspace(0, take.num_frames - 1, _SAMPLES).astype(int))
+        """Some frames, in which views are compared."""
+        if user is not None:
+            self._seen = SeenHands(take, self.sampled)
+            self._arms = user.axes(take.qpos[self.sampled, :, :3], user.forearms[self.sampled])
         known = np.flatnonzero(self._there.any(axis=1))
         flat = self.points[known].reshape(len(known), -1, 3).astype(np.float64)
         middles = 0.5 * (np.nanmin(flat, axis=1) + np.nanmax(flat, axis=1))
@@ -140,20 +144,15 @@ class Framing:
             total = total * (1.0 - np.nan_to_num(covered))
         return np.where(there.any(axis=1), total, np.nan)
 
-    def clear_share(self, positions: Doubles, frames: Integers) -> float:
-        """Share of these frames in which arms hide less than `_MOST_HIDDEN_SHARE` of each hand's keypoints.
+    def clear_share(self, positions: Float[np.ndarray, "F 3"]) -> float:
+        """Share of the sampled frames that hide less than `MOST_HIDDEN` of each hand's keypoints.
 
-        The cameras are at these positions (F, 3) [m]. Nobody has arms if their user is not known.
+        The cameras are at these positions [m]. Nobody has arms if their user is not known.
         """
-        if self._arms is None:
+        if self.user is None:
             return 1.0
-        points = self.points[frames].astype(np.float64)
-        hidden = most_hidden(self._arms[frames], np.ascontiguousarray(positions), points)
-        return float((hidden < _MOST_HIDDEN_SHARE).mean())
-
-    def sampled(self) -> Integers:
-        """Some frames, in which views are compared."""
-        return np.unique(np.linspace(0, len(self.points) - 1, _SAMPLES).astype(int))
+        hidden = self._seen.most_hidden(self._arms, positions[:, None])
+        return float((hidden < MOST_HIDDEN).mean())
 
     def shortest(
         self, camera: Camera, centers: Doubles, rotations: Doubles, frames: Integers | None = None
@@ -424,10 +423,10 @@ def _largest(
     config: ViewConfig, framing: Framing, ways: Iterator[Doubles], rng: np.random.Generator
 ) -> _Path:
     """A camera in the first of these directions (T, 3) that shows hands large enough, or in the best one."""
-    best, chosen, frames = np.inf, None, framing.sampled()
+    best, chosen, frames = np.inf, None, framing.sampled
     for directions in ways:
         farther, path = _followed(config, framing, directions, rng)
-        free = framing.clear_share(path.poses[frames, :3, 3], frames)
+        free = framing.clear_share(path.poses[frames, :3, 3])
         if chosen is None and (config.distance or farther <= _ENOUGH) and free >= _CLEAR_SHARE:
             return path
         shares = framing.shares(path.camera, path.poses, _CLOSER * config.share)
@@ -444,14 +443,14 @@ def _largest(
 def _lingering(config: ViewConfig, framing: Framing, turned: Doubles, elevation: float) -> Doubles:
     """Azimuths (T,) of an even turn, changed so that they pass quickly where hands would be small."""
     camera, azimuths = preset(config.camera), np.linspace(0.0, 2.0 * np.pi, _AZIMUTHS, endpoint=False)
-    frames, shares = framing.sampled(), []
+    frames, shares = framing.sampled, []
     for azimuth in azimuths:
         directions = np.tile(_spherical(azimuth, elevation), (len(frames), 1))
         centers, rotations = framing.centers[frames], looking(directions)
         away = framing.shortest(camera, centers, rotations, frames)[:, None] * directions
         poses = rigid(rotations, centers + away)
         share = np.nanmedian(framing.shares(camera, poses, _CLOSER * config.share, frames))
-        shares.append(min(share, config.share) * framing.clear_share(poses[:, :3, 3], frames))
+        shares.append(min(share, config.share) * framing.clear_share(poses[:, :3, 3]))
     time = (np.array(shares) / config.share) ** _LINGER
     time = np.maximum(time, _QUICKEST * time.max())
     passed = np.concatenate([[0.0], np.cumsum(time)]) / time.sum() * 2.0 * np.pi
@@ -496,13 +495,21 @@ def _distance_of(camera: Camera, side: Doubles | float, share: Doubles | float) 
 
 def _head(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Generator) -> list[_Path]:
     """At the user's eyes, turned to the hands; several cameras stand side by side, as two eyes do."""
-    user = UserBody(take) if framing.user is None else framing.user
+    user = UserBody(take, sees=True) if framing.user is None else framing.user
     camera, eyes = preset(config.camera), user.eyes + rng.uniform(-_MOUNTED, _MOUNTED, 3)
-    distances, rotations = _turned_to(eyes, framing.followed())
-    lacking = np.quantile(
-        framing.shortest(camera, framing.followed(), rotations) - distances, _HEAD_SEEN_SHARE
-    )
-    eyes -= np.clip(lacking, 0.0, _LEAN) * rotations[..., 2].mean(axis=0)
+    frames, followed, tried = framing.sampled, framing.followed(), list[tuple[Doubles, Doubles, float]]()
+    _, rotations = _turned_to(eyes, followed)
+    axes = np.stack([-rotations[..., 2].mean(axis=0), user.right, [0.0, 0.0, 1.0]])
+    for place in eyes + _LEANS @ axes:
+        distances, turned = _turned_to(place, followed)
+        needed = (framing.shortest(camera, followed, turned) / distances)[frames]
+        inside = (needed <= 1.0) + np.clip(2.0 - needed, 0.0, 1.0)  # hands that leave pictures do so little
+        tried.append((place, rigid(turned, place)[frames], float(inside.mean())))
+    trials = ([[camera.at(pose)] for pose in poses] for _, poses, _ in tried)
+    hidden = user.hidden(take, SeenHands(take, frames), frames, trials)
+    clear = np.array([(share < MOST_HIDDEN).mean() for share in hidden])
+    worth = clear + [inside for *_, inside in tried]
+    eyes = tried[int(np.argmax(worth - _EFFORT * np.linalg.norm(_LEANS, axis=1)))][0]
     paths = []
     for number in range(config.views):
         aside = 0.064 * (number - 0.5 * (config.views - 1)) * user.right

@@ -64,21 +64,25 @@ def test_trunks_and_heads_are_no_obstacle_between_hands_and_the_cameras_of_a_rig
     cameras, points = load_rig("six").T_world_camera[:, :3, 3], Framing(take).points.astype(float)
     user = UserBody(take, cameras)
     trunk = np.tile(user.trunk, (len(points), 1, 1, 1))
-    free = [most_hidden(trunk, np.tile(eye, (len(points), 1)), points) < 0.5 for eye in cameras]
+    nothing = np.zeros(points.shape[:3])
+    free = [most_hidden(trunk, np.tile(eye, (len(points), 1)), points, nothing) < 0.5 for eye in cameras]
     assert np.mean(free) >= 0.95
 
 
 def test_a_camera_behind_or_in_the_person_sees_no_hand_and_one_before_the_person_does(take):
     user = UserBody(take)
-    framing, frames = Framing(take, user), np.arange(0, take.num_frames, 10)
+    framing = Framing(take, user)
     middle = framing.middle()
     back = (user.eyes - middle) * (1.0, 1.0, 0.0)
 
     def free(eye: np.ndarray) -> float:
-        return framing.clear_share(np.tile(eye, (len(frames), 1)), frames)
+        return framing.clear_share(np.tile(eye, (len(framing.sampled), 1)))
 
     assert free(middle + 2.0 * back) == free(middle + back) == 0.0
-    assert free(middle - 1.5 * back + (0.0, 0.0, 0.3)) > 0.5
+    aside = 0.7 * np.cross(back, (0.0, 0.0, 1.0))  # from ahead one hand may be behind the other
+    assert (
+        max(free(middle - 1.5 * back + way + (0.0, 0.0, 0.3)) for way in (-aside, 0.0 * aside, aside)) > 0.5
+    )
 
 
 def test_a_hand_that_is_not_there_has_no_arm():
