@@ -28,6 +28,7 @@ from handsim.files.outputs import write_text, writing
 from handsim.hand.shape import SIDES, Side
 from handsim.kernels import move, velocity_of, write_quaternion_matrix
 from handsim.space.objects import RigidObject, named_object, object_names
+from handsim.space.transforms import quaternion_matrix
 from track.bodies.constellation import (
     FEWEST,
     assign_remaining,
@@ -65,6 +66,11 @@ _LONGEST_PREDICTION: Final = 0.25  # [s] A body without a fit for longer may be 
 _FIRST_RADIUS, _MOST_SPEED = 0.005, 1.5  # [m], [m/s]: search radius with unknown velocity
 _RADIUS, _MOST_ACCELERATION = 0.002, 30.0  # [m], [m/s^2]: search radius with known velocity
 _CONFIDENT_RADIUS: Final = 0.03  # [m] largest search radius in which three markers suffice
+_WRIST_RADIUS: Final = (
+    0.06  # [m] A forearm ends this near to the wrist of its hand; landmarks may be on a bar across it.
+)
+LEAST_ALIKE: Final = 0.3
+"""Least cosine of the angle between the thumb's sides of a hand and its forearm."""
 _MOST_CANDIDATE_MOTION: Final = 0.02  # [m] largest motion per frame of an unconfirmed candidate
 _MOST_SEARCHED_POINTS: Final = 250  # largest number of points in a search: 30 ms, cubic in it
 BODY_SUFFIX: Final = ".toml"
@@ -199,8 +205,14 @@ class BodyTracker:
             self.step(there, np.arange(len(there)), number / 120.0)
         self._reset()
 
-    def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> BodyFrame:
-        """Track the body among the finite points of the next frame."""
+    def step(
+        self,
+        points: Float[np.ndarray, "N 3"],
+        ids: Int[np.ndarray, "N"],
+        time: float,
+        wrist: Float[np.ndarray, "7"] | None = None,
+    ) -> BodyFrame:
+        """Track the body among the finite points of the next frame; `wrist` is that of a forearm's hand."""
         # Copy, because read-only or non-contiguous arrays would compile a kernel anew.
         points, ids = np.array(points, dtype=np.float64, order="C"), np.array(ids, dtype=np.int64)
         elapsed = time - self._time
@@ -210,7 +222,7 @@ class BodyTracker:
                 return frame
             self._lose()
         carried = self._carried(points, ids)
-        return self._initialize(points, ids, time, elapsed, carried)
+        return self._initialize(points, ids, time, elapsed, carried, wrist)
 
     def _reset(self) -> None:
         self._pose, self._velocity, self._time = np.full(7, np.nan), np.zeros(6), -np.inf  # of the last fit
@@ -281,8 +293,12 @@ class BodyTracker:
         time: float,
         elapsed: float,
         carried: NDArray[np.int64],
+        wrist: NDArray[np.float64] | None,
     ) -> BodyFrame:
-        """Search the body near its predicted pose, then anywhere; `carried` points need no confirmation."""
+        """Search the body near its predicted pose, then anywhere.
+
+        `carried` points need no confirmation, and a forearm whose hand is where it ends has it.
+        """
         if 0.0 < elapsed <= _LONGEST_PREDICTION:
             radius = self._search_radius(elapsed)
             match = self._match(points, self._predict(elapsed), radius)
@@ -290,7 +306,8 @@ class BodyTracker:
                 return self._accept(Status.INITIALIZED, match, points, ids, time)
         match = self._match(points)
         if match.num_points >= FEWEST:
-            if ((match.assignment == carried) & (carried >= 0)).sum() > 1:
+            is_known = ((match.assignment == carried) & (carried >= 0)).sum() > 1
+            if is_known or (wrist is not None and self._ends_at(wrist, match.pose)):
                 return self._accept(Status.INITIALIZED, match, points, ids, time)
             there = transform_markers(self._positions, match.pose)
             before = transform_markers(self._positions, self._candidate)
@@ -302,6 +319,14 @@ class BodyTracker:
         else:
             self._confirmed = 0
         return BodyFrame(Status.LOST, None, self._labels(carried, ids), np.nan)
+
+    def _ends_at(self, wrist: NDArray[np.float64], pose: NDArray[np.float64]) -> bool:
+        """Whether the body at a pose is a forearm that ends at a hand's wrist, thumbs' sides alike."""
+        if self.template.forearm is None or not self.template.has_axes:
+            return False
+        thumbs = quaternion_matrix(np.stack([wrist[3:], pose[3:]]))[:, :, 1]
+        is_near = np.linalg.norm(wrist[:3] - pose[:3]) < _WRIST_RADIUS
+        return bool(is_near and thumbs[0] @ thumbs[1] > LEAST_ALIKE)
 
     def _predict(self, elapsed: float) -> NDArray[np.float64]:
         """Predict the pose after some time [s] with constant velocity."""
@@ -475,10 +500,11 @@ def _parse_body(table: Mapping[str, object]) -> RigidTemplate:
     name = _printable("the body's name", text_of(table, "name"))
     markers = [_parse_marker(entry, number) for number, entry in enumerate(tables_of(table, "marker"), 1)]
     positions = np.array([position for _, position in markers]).reshape(-1, 3)
-    limb = {part: cast("Side", text_of(table, part)) for part in ("forearm", "elbow") if part in table}
+    parts = ("forearm", "elbow")
+    forearm, elbow = (cast("Side", text_of(table, part)) if part in table else None for part in parts)
     axes, names = table.get("forearm_axes", False), tuple(marker for marker, _ in markers)
     check_type("forearm_axes", axes, bool, "true or false")
-    return RigidTemplate(name, names, 1e-3 * positions, None, has_axes=bool(axes), **limb)
+    return RigidTemplate(name, names, 1e-3 * positions, None, forearm, bool(axes), elbow)
 
 
 def _parse_marker(table: Mapping[str, object], number: int) -> tuple[str, list[float]]:
