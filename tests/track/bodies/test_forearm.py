@@ -22,8 +22,8 @@ from handsim.hand.angles import WRIST_NAMES
 from handsim.space.transforms import MIRROR, pose_matrices, random_quaternions, rotation_quaternions
 from poses import sample_motion
 from render.user_body import UserBody
-from track import RigidTemplate, label_capture, track_capture
-from track.bodies.forearm import found_forearm, limb_of_landmarks
+from track import RigidTemplate, calibrate, label_capture, track_capture
+from track.bodies.forearm import found_forearm, limb_of_landmarks, wrist_variances
 from track.bodies.rigid_body import BodyTracker, learn_body, load_bodies, load_body, save_body
 from track.takes.take_faults import find_faults
 from track.takes.take_figures import PageSettings
@@ -156,6 +156,26 @@ def test_stated_deviations_of_measured_hands_hold():
         whole = np.concatenate([ratio[:, columns].ravel() for ratio in ratios])
         whole = whole[np.isfinite(whole)]
         assert once[0] < (whole < 1.0).mean() < once[1] and twice[0] < (whole < 2.0).mean() < twice[1]
+
+
+def test_gluing_and_person_of_a_palm_count_less_as_its_markers_are_many():
+    take = tracked("right")
+    parts = wrist_variances(take, "right", np.ones((take.num_frames, 3, 5)))[:, :2]
+    np.testing.assert_allclose(np.nanmean(parts, axis=(0, 1))[1:], [0.36, 1.0, 0.36, 1.0])
+
+
+@pytest.mark.slow
+def test_stated_deviations_of_calibrated_hands_hold():
+    ratios = []
+    for person, side in enumerate(("left", "right") * 2, 101):
+        one = scene(side, 2400, person)
+        user = calibrate(one.capture, glove="dense19", hands=(side,))
+        take = track_capture(one.capture, hands=user, bodies=[one.arm])
+        off = (wrist_of(take) - one.angles)[:, :2]
+        spreads = np.transpose([take.angle_spreads(side)[name] for name in WRIST_NAMES[:2]])
+        ratios.append(np.abs(off / spreads)[np.isfinite(off).all(axis=1)].ravel())
+    whole = np.concatenate(ratios)
+    assert 0.6 < (whole < 1.0).mean() < 0.8 and 0.92 < (whole < 2.0).mean() < 0.99
 
 
 def test_every_label_of_the_arm_is_right():
