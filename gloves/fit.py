@@ -51,6 +51,9 @@ _STALK_CONVERGED: Final = 2e-4  # [m] distance of a stalk's axis from its target
 _MAX_BONE_ERROR: Final = 5e-4  # largest distance from its target at which a marker keeps its bone [m]
 _CURVATURE_RADIUS: Final = 0.006  # radius of curvature of a fingertip's skin [m]
 _SPACING: Final = 4e-3  # rough distance between neighboring skin vertices [m]
+# A forearm in lengths of the hand: its length, and half of its breadth and of its depth at wrist and elbow.
+_FOREARM_LENGTH: Final = 1.4
+_FOREARM_HALVES: Final = np.array([[0.175, 0.11], [0.24, 0.22]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -558,6 +561,23 @@ def nominal_fit(layout: MarkerLayout | str | Path, size: str, side: Side) -> Glo
     worn.check_side(side)
     check_layout(worn)
     return settle_glove(worn, model)
+
+
+def forearm_markers(
+    layout: MarkerLayout, length: float, side: Side
+) -> tuple[Float[np.ndarray, "Q 3"], Float[np.ndarray, "Q 3"]]:
+    """Markers on the forearm of a hand of some length [m], and the outward directions of the skin there.
+
+    The frame is that of the wrist of a straight hand. Cross sections of the forearm are ellipses.
+    """
+    along, around, height = np.array([(one.along, one.around, one.height) for one in layout.forearm]).T
+    wrist, elbow = length * _FOREARM_HALVES
+    halves = wrist + along[:, None] * (elbow - wrist)
+    turn = np.column_stack([np.sin(around), np.cos(around)])
+    normals = np.column_stack([np.zeros(len(along)), unit(turn / halves)])
+    skin = np.column_stack([-_FOREARM_LENGTH * length * along, halves * turn])
+    mirror = MIRROR if side == "left" else np.eye(3)
+    return (skin + (layout.radius + height)[:, None] * normals) @ mirror, normals @ mirror
 
 
 def nearest_markers(fit: GloveFit) -> tuple[str, str, float]:

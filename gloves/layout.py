@@ -46,9 +46,11 @@ ACROSS_RANGE: Final = (-1.0, 1.0)
 """Range of `MarkerPlace.across`."""
 HEIGHT_RANGE: Final = (0.0, 0.05)
 """Range of `MarkerPlace.height` [m]."""
+FOREARM: Final = "forearm"
+"""Bone of markers beyond the wrist's joint, which are not on the hand but on a rigid body beside it."""
+_FEWEST_ON_FOREARM: Final = 3
 _ARM_HINTS: Final = {
-    "wrist": "for a marker that moves with the hand write palm, with along from -0.15 to 0",
-    "forearm": "markers beyond the wrist's joint are a rigid body of their own (handsim body --forearm)",
+    "wrist": "for a marker that moves with the hand write palm, along from -0.15 to 0; for others forearm"
 }
 _ALIASES: Final = {name.replace("little", "pinky"): name for name in BONE_NAMES if name.startswith("little")}
 """Other names of bones."""
@@ -71,7 +73,8 @@ class MarkerPlace:
 
     name: str
     bone: str
-    """One of `handsim.hand.shape.BONE_NAMES`; pinky_distal is another name of little_distal, and so on."""
+    """One of `handsim.hand.shape.BONE_NAMES`, or forearm; pinky_distal is another name of little_distal, and
+    so on."""
     along: float
     """Position along the bone: 0 at its near end, 1 at its far end, and up to 0.3 beyond either."""
     around: float
@@ -83,7 +86,8 @@ class MarkerPlace:
 
     def __post_init__(self) -> None:
         check_type("name of a marker", self.name, str, "text")
-        check_type(f"bone of marker '{self.name}'", self.bone, str, "the name of one", BONE_NAMES)
+        bones = (*BONE_NAMES, FOREARM)
+        check_type(f"bone of marker '{self.name}'", self.bone, str, "the name of one", bones)
         object.__setattr__(self, "bone", _ALIASES.get(self.bone, self.bone))
         for key in ("along", "around", "across", "height"):
             kinds = (int, float, np.number)
@@ -96,8 +100,8 @@ class MarkerPlace:
             raise LayoutError(
                 f"marker '{self.name}': {self.bone} is not a bone of the hand; {_ARM_HINTS[self.bone]}"
             )
-        if self.bone not in BONE_NAMES:
-            raise LayoutError(f"marker '{self.name}': {choices(self.bone, BONE_NAMES, noun='bone')}")
+        if self.bone not in bones:
+            raise LayoutError(f"marker '{self.name}': {choices(self.bone, bones, noun='bone')}")
         degrees, millimeters = round(math.degrees(self.around), 9), round(1e3 * self.height, 9)
         heights = (0.0, 1e3 * HEIGHT_RANGE[1])
         for key, value, (low, high), unit, given in (
@@ -136,10 +140,13 @@ class MarkerLayout:
 
     name: str
     markers: tuple[MarkerPlace, ...]
+    """Markers of the hand. Those given with the bone forearm become those of `forearm`."""
     radius: float
     """Radius of every marker [m]."""
     sides: tuple[Side, ...] = SIDES
     """The hands that the glove fits: both, or one."""
+    forearm: tuple[MarkerPlace, ...] = ()
+    """Markers of the forearm, none or three and more: a rigid body beside the hand."""
 
     def __post_init__(self) -> None:
         check_type("name of a layout", self.name, str, "text")
@@ -148,14 +155,21 @@ class MarkerLayout:
             check_type("marker of a layout", marker, MarkerPlace, "a MarkerPlace")
         check_type("radius of a layout", self.radius, (int, float, np.number), "a number [m]")
         check_type("sides of a layout", self.sides, (tuple, list), "the sides that it fits", SIDES)
-        object.__setattr__(self, "markers", tuple(self.markers))
+        given = *self.markers, *self.forearm
+        for key, is_beyond in (("markers", False), ("forearm", True)):
+            object.__setattr__(self, key, tuple(one for one in given if (one.bone == FOREARM) == is_beyond))
         if not self.name or not self.name.isprintable():
             raise LayoutError(f"layout name {self.name!r}: expected printable characters")
         if not MIN_MARKERS <= self.num_markers <= MAX_MARKERS:
             raise LayoutError(
                 f"a layout needs {MIN_MARKERS} to {MAX_MARKERS} markers, got {self.num_markers}"
             )
-        names = self.names
+        if 0 < len(self.forearm) < _FEWEST_ON_FOREARM:
+            raise LayoutError(
+                f"the forearm has too few markers ({len(self.forearm)}), expected none, or "
+                f"{_FEWEST_ON_FOREARM} or more, which determine its pose"
+            )
+        names = tuple(one.name for one in (*self.markers, *self.forearm))
         for index, name in enumerate(names):
             if name in names[:index]:
                 raise LayoutError(f"two markers are named '{name}'; every marker needs a name of its own")
@@ -204,6 +218,13 @@ class MarkerLayout:
     def num_markers(self) -> int:
         """Number of markers, M."""
         return len(self.markers)
+
+    def record(self) -> dict[str, Any]:
+        """The layout as JSON, for `stored_layout`; one without a forearm has no entry of it."""
+        stored = dataclasses.asdict(self)
+        if not self.forearm:
+            del stored["forearm"]
+        return stored
 
     def save(self, path: str | Path, *, description: str = "", source: str = "") -> None:
         """Write the layout as TOML, numbers to nine decimals; `load_layout` gives the same layout again.
@@ -297,9 +318,11 @@ def shipped_layout(name: str) -> ShippedLayout:
 
 
 def stored_layout(stored: Mapping[str, Any]) -> MarkerLayout:
-    """A layout from its record in takes and training sets, made by `dataclasses.asdict`."""
-    markers = tuple(MarkerPlace(**marker) for marker in stored["markers"])
-    return MarkerLayout(**{**stored, "markers": markers})
+    """A layout from its `MarkerLayout.record` in takes and training sets."""
+    markers, forearm = (
+        tuple(MarkerPlace(**one) for one in stored.get(key, ())) for key in ("markers", FOREARM)
+    )
+    return MarkerLayout(**{**stored, "markers": markers, "forearm": forearm})
 
 
 def starter_layout() -> str:
@@ -312,7 +335,7 @@ def layout_lines(layout: MarkerLayout) -> list[str]:
     lines = [f"name = {toml_string(layout.name)}", f"radius_mm = {toml_number(layout.radius * 1e3)}"]
     if set(layout.sides) != set(SIDES):
         lines.append(f"sides = [{', '.join(map(toml_string, layout.sides))}]")
-    for marker in layout.markers:
+    for marker in (*layout.markers, *layout.forearm):
         lines += ["", "[[marker]]", *(f"{key} = {text}" for key, text in _marker_texts(marker).items())]
     return lines
 
@@ -365,9 +388,10 @@ def moved_text(text: str, layout: MarkerLayout) -> tuple[str, bool]:
     """
     lines = text.splitlines()
     starts = [number for number, line in enumerate(lines) if _TABLE_LINE.match(line)]
-    if len(starts) == layout.num_markers:
+    markers = *layout.markers, *layout.forearm
+    if len(starts) == len(markers):
         ends = [*starts[1:], len(lines)]
-        for start, end, marker in reversed(list(zip(starts, ends, layout.markers, strict=True))):
+        for start, end, marker in reversed(list(zip(starts, ends, markers, strict=True))):
             lines[start + 1 : end] = _moved_table(lines[start + 1 : end], marker)
         changed = "\n".join(lines) + "\n"
         if _is_text_of(changed, layout):

@@ -32,6 +32,8 @@ from track.alternatives.alternatives import doubts_of, judge_take, with_doubt
 from track.alternatives.hands import other_hands_of, with_other_hands
 from track.association.frame_state import change_of_distances
 from track.association.initialization import label_alone
+from track.bodies.forearm import find_forearms
+from track.bodies.rigid_body import load_bodies
 from track.frames import AnyCapture, StreamedFrame, TrackedFrame, capture_of, checked_frames
 from track.hand_size import measured_user, sample_frames
 from track.kinematics.pose_solver import FEWEST_MARKERS
@@ -121,6 +123,7 @@ def _labeled_take(
         number_runs(present),
         np.full(present.shape, -1, dtype=np.int16),
         rate=source.rate,
+        bodies=setup.bodies,
         settings={**_capture_record(capture, source), "glove": glove},
     )
 
@@ -377,7 +380,26 @@ def _open_capture(
 
 def _setup(settings: LabelSettings, frames: Sequence[StreamedFrame], *, warns: bool = False) -> TrackerSetup:
     """The setup that labels frames; hands are measured unless settings give them."""
-    return TrackerSetup.of(settings).measured(sample_frames(frames), warns=warns)
+    some = sample_frames(frames)
+    return _with_forearms(TrackerSetup.of(settings).measured(some, warns=warns), some)
+
+
+def _with_forearms(setup: TrackerSetup, frames: Sequence[StreamedFrame]) -> TrackerSetup:
+    """The setup with the forearms of a layout where some frames show them and no file of one was given."""
+    given, layout = {body.forearm for body in setup.bodies}, setup.user.layout
+    if not layout.forearm or given.issuperset(setup.user.sides):
+        return setup
+    bodies = [*setup.bodies]
+    for side, body in find_forearms([one.points for one in frames], setup.user.hands, setup.labeler).items():
+        if body is not None and side not in given:
+            bodies.append(body)
+        elif body is None:
+            names = ", ".join(one.name for one in layout.forearm)
+            told = (
+                f"the {side} forearm is not found, expected {names} to keep their distances beside the hand"
+            )
+            warnings.warn(told, HandSimWarning, stacklevel=5)
+    return dataclasses.replace(setup, bodies=load_bodies(bodies))
 
 
 def _capture_record(capture: AnyCapture, source: Capture) -> dict[str, Any]:

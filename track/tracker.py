@@ -190,7 +190,10 @@ class Tracker:
         """Track every body; return also the labels (P,) of their points."""
         labels, bodies = np.full(len(incoming.points), -1), []
         for owner, tracker in enumerate(self._bodies, start=len(self._states)):
-            body = tracker.step(incoming.points, incoming.ids, incoming.time)
+            side = tracker.template.forearm
+            wrists = (one.qpos for one in self._states if one.qpos is not None and one.hand.side == side)
+            wrist = next((qpos[:7] for qpos in wrists), None)
+            body = tracker.step(incoming.points, incoming.ids, incoming.time, wrist)
             labels = self._numbering.with_markers(owner, body.labels, labels)
             position, rotation = np.full(3, np.nan), np.full(4, np.nan)
             if body.T_world_body is not None:

@@ -161,7 +161,7 @@ class User(Sequence[GloveFit]):
             "schema": SCHEMA,
             "units": f"{units}; every hand is described as a right one, its markers as they are",
             "notes": self.notes,
-            "glove": dataclasses.asdict(self.layout),
+            "glove": self.layout.record(),
             "hands": [_to_json(hand) for hand in self.hands],
             **({"errors": errors} if errors else {}),
         }

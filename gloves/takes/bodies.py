@@ -44,6 +44,8 @@ class RigidBody:
     elbow: Side | None = None
     """The hand whose elbow it is. An elbow does not turn when the forearm pronates. Its y axis goes through
     the epicondyles, and is parallel to the forearm's y axis in full supination."""
+    is_nominal: bool = False
+    """Whether a layout gives its axes, from which markers differ as they are glued."""
 
     @classmethod
     def of(cls, thing: RigidObject) -> RigidBody:
@@ -86,6 +88,7 @@ class RigidBody:
         """The body in the header of a take's file, without its arrays."""
         named: dict[str, Any] = {"name": self.name, "marker_names": list(self.marker_names)}
         named |= {} if self.surface is None else {"surface": True}
+        named |= {"nominal": True} if self.is_nominal else {}
         return named | self.limb | ({} if self.forearm is None else {"axes": self.has_axes})
 
 
@@ -105,7 +108,8 @@ def stored_body(
 ) -> RigidBody:
     """A body of a file by its record; `RigidObject` checks the arrays of its surface."""
     name, marker_names = stored["name"], names_of(stored["marker_names"])
-    limb = stored.get("forearm"), bool(stored.get("axes", False)), stored.get("elbow")
+    has_axes, is_nominal = (bool(stored.get(key, False)) for key in ("axes", "nominal"))
+    limb = stored.get("forearm"), has_axes, stored.get("elbow"), is_nominal
     positions = arrays[BODY_MARKERS.name][markers.start : markers.stop]
     if not stored.get("surface", False):
         return RigidBody(name, marker_names, positions, None, *limb)

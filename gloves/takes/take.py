@@ -693,10 +693,11 @@ class Take:
             names = tuple(name for name, keeps in zip(names, kept, strict=True) if keeps)
             columns = np.cumsum(kept) - 1
         else:
-            names = self.hands[0].layout.names
-            columns = np.full(len(self.label_names), -1)  # Markers of bodies have no name there.
-            for hand in self.hand_labels:
-                columns[hand.start : hand.stop] = range(len(hand))
+            worn = self.hands[0].layout
+            names = (*worn.names, *(one.name for one in worn.forearm))
+            own = [name for hand in self.hands for name in hand.layout.names]
+            own += [name if body.forearm else "" for body in self.bodies for name in body.marker_names]
+            columns = np.array([names.index(name) if name in names else -1 for name in own])
         labels = np.where(labels >= 0, columns[labels], -1)
         begins = self.point_list.starts[1:-1]
         frames, rows = (np.split(values, begins) for values in (self.point_list.points, labels))
@@ -912,7 +913,7 @@ def take_header(
         "handsim": full_version(),
         "units": "metres, radians, seconds, wxyz, world frame",
         "rate": rate,
-        "layouts": [dataclasses.asdict(hand.layout) for hand in hands],
+        "layouts": [hand.layout.record() for hand in hands],
         "statuses": STATUSES,
         "keypoint_names": KEYPOINT_NAMES,
         "bodies": [body.record() for body in bodies],

@@ -42,7 +42,7 @@ def list_glove(out: Path | None = None) -> None:
         shipped = shipped_layout(name)
         labeler = "comes with it" if name in labeled else "for any layout"
         text = Text(shipped.description).append(f"\n{shipped.source}", "dim")
-        rows.append([name, str(shipped.layout.num_markers), labeler, text])
+        rows.append([name, _count(shipped.layout), labeler, text])
     print_table(rows, left=4, wraps=True)
     print_line(
         "The labeler for any layout needs no training. One of its own for NAME: handsim generate --glove "
@@ -58,6 +58,11 @@ def list_glove(out: Path | None = None) -> None:
         print_line(f"{out}: the gloves on hands of size M")
 
 
+def _count(layout: MarkerLayout) -> str:
+    """The number of markers, those on the forearm counted apart."""
+    return f"{layout.num_markers}{f' + {len(layout.forearm)}' if layout.forearm else ''}"
+
+
 def show_glove(glove: Annotated[str, tyro.conf.Positional]) -> None:
     """Show a layout's markers.
 
@@ -66,12 +71,12 @@ def show_glove(glove: Annotated[str, tyro.conf.Positional]) -> None:
     """
     layout = load_layout(glove)
     rows = [["", "name", "bone", "along", "around [deg]", "across", "stalk [mm]"]]
-    for number, marker in enumerate(layout.markers):
+    for number, marker in enumerate((*layout.markers, *layout.forearm)):
         across = f"{marker.across:.2f}" if marker.bone == "palm" else ""
         around = f"{np.rad2deg(marker.around):.0f}"
         height = f"{1e3 * marker.height:.1f}" if marker.height else ""
         rows.append([str(number), marker.name, marker.bone, f"{marker.along:.2f}", around, across, height])
-    print_line(f"{layout.name}: {layout.num_markers} markers")
+    print_line(f"{layout.name}: {_count(layout)} markers")
     print_table(rows, left=3)
     print_line(
         f"Radius {1e3 * layout.radius:.1f} mm. Along: 0 at the bone's near end, 1 at its far end. Around: 0 "
@@ -185,7 +190,7 @@ def check_glove(
         if moved:
             where = f"off its digit on size {name}, where it is worn nearer to the middle of its bone's back"
             warnings.warn(f"{glove}: {', '.join(moved)} would be {where}", HandSimWarning, stacklevel=2)
-    print_table(rows, left=2, title=f"{layout.name}: {layout.num_markers} markers")
+    print_table(rows, left=2, title=f"{layout.name}: {_count(layout)} markers")
     if overlaps:
         overlap = f"{glove}: markers of {2e3 * layout.radius:.1f} mm overlap: {', '.join(overlaps.values())}"
         if "M" in overlaps:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import gloves.layout
 from gloves import MarkerLayout, MarkerPlace, load_layout
-from gloves.fit import nominal_fit
+from gloves.fit import forearm_markers, nominal_fit
 from gloves.layout import list_layouts, moved_text, shipped_layout, starter_layout, stored_layout
 from handsim.errors import LayoutError
 from handsim.hand.shape import BONE_NAMES, SIZES
@@ -41,6 +41,7 @@ LAYOUTS = st.builds(
     st.lists(PLACES, min_size=5, max_size=60, unique_by=lambda place: place.name).map(tuple),
     st.floats(0.0005, 0.015),
     st.sampled_from([("left", "right"), ("right",), ("left",)]),
+    st.sampled_from([(), load_layout("clinical26").forearm]),
 )
 TOP = 'name = "g"\nradius_mm = 3.2'
 DENSE = (Path(gloves.layout.__file__).parent / "layouts" / "dense19.toml").read_text("utf-8")
@@ -50,7 +51,7 @@ ONE_SIDED = DENSE.replace("radius_mm", 'sides = ["left"] # the other hand wears 
 
 
 def test_shipped_layouts() -> None:
-    names = "dense19 dfki13 sparse13 starter10 starter15 starter30 starter6 tips8"
+    names = "clinical26 dense19 dfki13 sparse13 starter10 starter15 starter30 starter6 tips8"
     assert list_layouts() == tuple(names.split())
     dense, sparse = load_layout("dense19"), load_layout("sparse13")
     assert list(dense.names) == DENSE19
@@ -68,7 +69,8 @@ def test_shipped_layouts_fit_every_hand(name: str) -> None:
     layout = shipped.layout
     assert layout == load_layout(name) and layout.name == name
     assert shipped.description and shipped.source
-    assert str(layout.num_markers) in name and str(layout.num_markers) in shipped.description
+    count = str(layout.num_markers + len(layout.forearm))
+    assert count in name and count in shipped.description
     for size in SIZES:
         right, left = (nominal_fit(layout, size, side).attachment.points for side in ("right", "left"))
         np.testing.assert_allclose(left, right * [1.0, -1.0, 1.0], atol=1e-9)
@@ -152,7 +154,8 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, layout: MarkerLayo
             (one.along, one.around, one.across), abs=1e-9
         )
         assert other.height == pytest.approx(one.height, abs=1e-12)
-    assert stored_layout(json.loads(json.dumps(dataclasses.asdict(layout)))) == layout
+    assert again.forearm == layout.forearm and ("forearm" in layout.record()) == bool(layout.forearm)
+    assert stored_layout(json.loads(json.dumps(layout.record()))) == layout
 
 
 def text(*, count: int = 5, radius_mm: str = "3.2", top: str = "", **keys: str) -> str:
@@ -172,7 +175,7 @@ BAD = {
         "m1 | index_proximl | index_proximal | palm | little_distal",
     ),
     "on the wrist": (text(bone='"wrist"'), "m1 | wrist | palm | -0.15 to 0"),
-    "on the forearm": (text(bone='"forearm"'), "m1 | forearm | not a bone"),
+    "one on the forearm": (text(count=6, bone='"forearm"'), "forearm | (1) | 3 or more"),
     "two of one name": (text(name='"m0"'), "two markers | 'm0'"),
     "too few": (text(count=2), "5 to 60 | got 2"),
     "too many": (text(count=61), "5 to 60 | got 61"),
@@ -244,11 +247,38 @@ def test_what_is_no_layout_is_told(tmp_path: Path) -> None:
 
 
 def test_what_was_stored_before_stalks_and_sides_loads() -> None:
-    stored = json.loads(json.dumps(dataclasses.asdict(load_layout("dense19"))))
+    stored = json.loads(json.dumps(load_layout("dense19").record()))
     del stored["sides"]
     for marker in stored["markers"]:
         del marker["height"]
     assert stored_layout(stored) == load_layout("dense19")
+
+
+def test_markers_of_the_forearm_are_none_of_the_glove(tmp_path: Path) -> None:
+    layout = load_layout("clinical26")
+    assert layout.num_markers == 22 and "RadialStyloid" not in layout.names
+    assert [one.name for one in layout.forearm[:2]] == ["RadialStyloid", "UlnarStyloid"]
+    assert MarkerLayout("same", (*layout.forearm, *layout.markers), 0.0032).forearm == layout.forearm
+    assert nominal_fit(layout, "M", "right").attachment.points.shape == (22, 3)
+    twice = dataclasses.replace(layout.forearm[0], name="MCP2")
+    with error_names(LayoutError, "two markers | 'MCP2'"):
+        dataclasses.replace(layout, forearm=(twice, *layout.forearm))
+    moved = dataclasses.replace(layout.forearm[0], along=0.2)
+    changed, kept = moved_text(
+        Path(gloves.layout.__file__).with_name("layouts").joinpath("clinical26.toml").read_text("utf-8"),
+        dataclasses.replace(layout, forearm=(moved, *layout.forearm[1:])),
+    )
+    assert kept and "along = 0.2\n" in changed
+
+
+def test_the_forearm_is_beside_the_wrist_and_mirrored() -> None:
+    layout = load_layout("clinical26")
+    (right, out), (left, _) = (forearm_markers(layout, 0.19, side) for side in ("right", "left"))
+    np.testing.assert_allclose(left, right * [1.0, -1.0, 1.0])
+    np.testing.assert_allclose(np.linalg.norm(out, axis=1), 1.0)
+    assert (
+        (right[:, 0] < 0.0).all() and right[0, 1] > 0.03 > -0.03 > right[1, 1] and right[2:, 2].min() > 0.015
+    )
 
 
 def test_pinky_is_another_name_of_the_little_finger(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ pronation needs only the elbow's y axis, through the epicondyles, however the el
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Final
 
@@ -17,19 +18,111 @@ import numpy as np
 from jaxtyping import Float
 
 from gloves.captures.capture import Capture, select_markers
+from gloves.fit import GloveFit, forearm_markers
 from gloves.takes.take import Take
 from handsim.arrays import Doubles
 from handsim.errors import ArgumentError, CalibrationError
 from handsim.hand.shape import Side
-from handsim.space.transforms import unit
+from handsim.space.transforms import pose_matrices, rigid_fit, unit
+from track.association.hand_state import HandState
+from track.association.initialization import HandInitializer
 from track.bodies.constellation import FEWEST
-from track.bodies.rigid_body import RigidTemplate, track_body
+from track.bodies.rigid_body import LEAST_ALIKE, RigidTemplate, track_body
 from track.frames import capture_frames
 from track.kinematics.pose_spread import SOURCES
+from train.labelers.protocol import Labeler
 
+_FRAMES: Final = 60  # about as many frames are searched for a forearm
+_OFF: Final = 0.03
+"""Largest change of a distance between two markers, or a marker and the wrist, from the layout's [m]."""
+_GLUED: Final = 0.004
+"""Standard deviation of markers on a forearm from their layout [m], which turns the axes that it gives."""
+_MOST_OFF: Final = 0.02  # [m] largest RMS distance of a forearm's markers from those of its layout
+_SAME: Final = 0.006  # [m] Distances between the markers of a forearm change less from frame to frame.
+_LEAST_SHARE: Final = 0.3  # least share of the frames with a forearm that show the same one
 _CONSTANT_FACTOR: Final = 0.6
-"""Factor of gluing and person in the rotation of an uncalibrated palm, whose many markers average their
-errors: the constant errors of 60 simulated hands are 0.43 to 0.70 of those stated, in either angle."""
+"""Factor of gluing and person in the rotation of a palm, whose many markers average their errors: the
+constant errors of 60 simulated hands are 0.43 to 0.70 of those stated, in either angle; calibrated, 0.6."""
+
+
+def find_forearms(
+    clouds: Sequence[Float[np.ndarray, "N 3"]], hands: Sequence[GloveFit], labeler: Labeler
+) -> dict[Side, RigidTemplate | None]:
+    """The forearms of the hands in frames with these points [m], whose layout has one; None if not found."""
+    finder = HandInitializer([HandState(hand) for hand in hands], labeler, at_once=True)
+    wrists, beside = ([list[Doubles]() for _ in hands] for _ in range(2))
+    for points in clouds[:: max(1, len(clouds) // _FRAMES)]:
+        initialized = finder.initialize(points, range(len(hands)))
+        is_free = np.all([one.labels < 0 for one in initialized], axis=0) if initialized else None
+        for one in initialized:
+            wrists[one.index].append(pose_matrices(one.fit.qpos[:, :7])[0])
+            beside[one.index].append(points[is_free])
+    return {
+        hand.side: found_forearm(nominal_forearm(hand), np.array(poses), points)
+        for hand, poses, points in zip(hands, wrists, beside, strict=True)
+        if poses
+    }
+
+
+def nominal_forearm(hand: GloveFit) -> RigidTemplate:
+    """The forearm of a hand as the layout of its glove has it."""
+    layout, side = hand.layout, hand.side
+    positions, _ = forearm_markers(layout, hand.shape.length, side)
+    names = tuple(one.name for one in layout.forearm)
+    return RigidTemplate(f"{side}_forearm", names, positions, None, side, has_axes=True, is_nominal=True)
+
+
+def found_forearm(
+    nominal: RigidTemplate,
+    wrists: Float[np.ndarray, "F 4 4"],
+    clouds: Sequence[Float[np.ndarray, "N 3"]],
+) -> RigidTemplate | None:
+    """The forearm whose markers are those of its layout, roughly, and keep their distances.
+
+    Args:
+        nominal: The forearm as its layout has it, whose axes it keeps.
+        wrists: Poses `T_world_wrist` of the hand in some frames [m].
+        clouds: The points of each of these frames that are no marker of a hand [m].
+    """
+    found = [
+        _likest_points(nominal, (points - wrist[:3, 3]) @ wrist[:3, :3])
+        for wrist, points in zip(wrists, clouds, strict=True)
+    ]
+    shown = np.array([one for one in found if one is not None]).reshape(-1, len(nominal.positions), 3)
+    distances = np.linalg.norm(shown[:, :, None] - shown[:, None], axis=-1)
+    same = (np.abs(distances[:, None] - distances) < _SAME).all(axis=(2, 3))
+    count = same.sum(axis=1)
+    if count.max(initial=0) < max(FEWEST, _LEAST_SHARE * len(shown)):
+        return None
+    turns, shifts = rigid_fit(alike := shown[same[count.argmax()]], nominal.positions)
+    placed = alike @ turns.swapaxes(1, 2) + shifts[:, None]
+    return dataclasses.replace(nominal, positions=np.median(placed, axis=0))
+
+
+def _likest_points(
+    nominal: RigidTemplate, points: Float[np.ndarray, "N 3"]
+) -> Float[np.ndarray, "Q 3"] | None:
+    """The points beside a hand, in its frame [m], that are likest those of a forearm bent at the wrist."""
+    ours, wrist = nominal.positions, np.zeros((1, 3))
+    designed, there = np.concatenate([wrist, ours]), np.concatenate([wrist, points])
+    apart, far = (np.linalg.norm(one[:, None] - one, axis=2) for one in (designed, there))
+    chosen = [[0]]  # the wrist
+    for marker in range(1, len(designed)):
+        fits = (np.abs(far[one] - apart[:marker, marker, None]).max(axis=0) < _OFF for one in chosen)
+        chosen = [
+            [*one, k]
+            for one, fit in zip(chosen, fits, strict=True)
+            for k in np.flatnonzero(fit).tolist()
+            if k not in one
+        ]
+    if not chosen:
+        return None
+    there = there[np.array(chosen)]
+    turns, shifts = rigid_fit(designed, there)
+    squares = np.square(there - designed @ turns.swapaxes(1, 2) - shifts[:, None]).sum(axis=2).mean(axis=1)
+    squares[turns[:, 1, 1] < LEAST_ALIKE] = np.inf
+    best = squares.argmin()
+    return there[best, 1:] if squares[best] < _MOST_OFF**2 else None
 
 
 def limb_of_landmarks(body: RigidTemplate, capture: Capture, landmarks: Sequence[str]) -> RigidTemplate:
@@ -85,25 +178,26 @@ def _local_landmarks(body: RigidTemplate, capture: Capture, landmarks: Sequence[
     return np.asarray(np.nanmedian(local, axis=0))
 
 
-def wrist_variances(
-    take: Take, side: Side, hand: Float[np.ndarray, "T 3 5"], *, is_calibrated: bool
-) -> Float[np.ndarray, "T 3 5"]:
+def wrist_variances(take: Take, side: Side, hand: Float[np.ndarray, "T 3 5"]) -> Float[np.ndarray, "T 3 5"]:
     """Variances of the angles `WRIST_NAMES` [rad^2] by source, for small deviations and known axes.
 
     Args:
         take: The take.
         side: The hand, whose forearm is among the bodies; noise of bodies counts as the first source.
         hand: Variances of the hand's rotation about its own axes [rad^2], by source.
-        is_calibrated: Whether the hand is.
     """
     hands, forearms = take.arm_turns(side)
     forearm, elbow = take.forearm_index(side), take.elbow_index(side)
     assert forearm is not None
-    noise = _rotation_noise(take, forearm)
-    is_less = np.isin(SOURCES, ("gluing", "person")) & (not is_calibrated)
+    noise, body = _rotation_noise(take, forearm), take.bodies[forearm]
+    glued = (
+        _GLUED**2 * np.linalg.inv(_inertia(body.positions - body.positions.mean(axis=0))) * body.is_nominal
+    )
+    is_less = np.isin(SOURCES, ("gluing", "person"))
     found = np.full_like(hand, np.nan)
     found[:, :2] = hand[:, 1:] * np.where(is_less, _CONSTANT_FACTOR**2, 1.0)
     found[:, :2, 0] += (hands.swapaxes(1, 2) @ noise @ hands).diagonal(axis1=1, axis2=2)[:, 1:]
+    found[:, :2, 1] += (hands.swapaxes(1, 2) @ glued @ hands).diagonal(axis1=1, axis2=2)[:, 1:]
     found[np.isnan(found[:, 0, 0])] = np.nan
     if elbow is not None and take.bodies[forearm].has_axes:
         # Pronation is a rotation about the forearm, measured perpendicular to the line of the epicondyles
@@ -113,6 +207,7 @@ def wrist_variances(
         both = forearms @ noise @ forearms.swapaxes(1, 2) + _rotation_noise(take, elbow)
         found[:, 2] = 0.0
         found[:, 2, 0] = np.einsum("ti,tij,tj->t", axis, both, axis)
+        found[:, 2, 1] = np.einsum("ti,tij,tj->t", axis, forearms @ glued @ forearms.swapaxes(1, 2), axis)
         found[np.isnan(found[:, 2, 0]), 2] = np.nan
     return found
 
@@ -127,8 +222,12 @@ def _rotation_noise(take: Take, body: int) -> Float[np.ndarray, "T 3 3"]:
         seen, count = seen[shown].astype(float), count[shown]
         # A pose takes six of the markers' coordinates.
         noise = np.nanmean(np.square(take.body_rms[shown, body]) * count / (3 * count - 6))
-        local = markers - (seen @ markers / count[:, None])[:, None]
-        squares = np.einsum("tq,tqi,tqj->tij", seen, local, local)
-        inertia = squares.trace(axis1=1, axis2=2)[:, None, None] * np.eye(3) - squares
-        found[shown] = noise * np.linalg.inv(inertia)
+        local = seen[..., None] * (markers - (seen @ markers / count[:, None])[:, None])
+        found[shown] = noise * np.linalg.inv(_inertia(local))
     return found
+
+
+def _inertia(local: Float[np.ndarray, "*batch Q 3"]) -> Float[np.ndarray, "*batch 3 3"]:
+    """Moments of inertia [m^2] about their center of points of unit mass, given from it [m]."""
+    squares = local.swapaxes(-1, -2) @ local
+    return np.asarray(squares.trace(axis1=-1, axis2=-2)[..., None, None] * np.eye(3) - squares)

@@ -28,6 +28,7 @@ from handsim.files.outputs import write_text, writing
 from handsim.hand.shape import SIDES, Side
 from handsim.kernels import move, velocity_of, write_quaternion_matrix
 from handsim.space.objects import RigidObject, named_object, object_names
+from handsim.space.transforms import quaternion_matrix
 from track.bodies.constellation import (
     FEWEST,
     assign_remaining,
@@ -47,6 +48,10 @@ _FIRST_SEARCH_RADIUS, _MOST_SPEED = 0.005, 1.5  # [m], [m/s] search radius and i
 # [m], [m/s^2] search radius and its growth at known velocity
 _SEARCH_RADIUS, _MOST_ACCELERATION = 0.002, 30.0
 _CONFIDENT_RADIUS: Final = 0.03  # [m] largest search radius in which three markers suffice
+_WRIST_RADIUS: Final = 0.06
+"""A forearm ends this near to its hand's wrist [m]; landmarks may be on a bar across it."""
+LEAST_ALIKE: Final = 0.3
+"""Least cosine of the angle between the thumb's sides of a hand and its forearm."""
 _MOST_CANDIDATE_MOTION: Final = 0.02  # [m] largest motion per frame of an unconfirmed candidate
 _MOST_SEARCHED_POINTS: Final = 250  # largest number of points in a search: 30 ms, cubic in it
 BODY_SUFFIX: Final = ".toml"
@@ -209,8 +214,14 @@ class BodyTracker:
             self.step(there, np.arange(len(there)), number / 120.0)
         self._reset()
 
-    def step(self, points: Float[np.ndarray, "N 3"], ids: Int[np.ndarray, "N"], time: float) -> BodyFrame:
-        """Track the body among the finite points of the next frame."""
+    def step(
+        self,
+        points: Float[np.ndarray, "N 3"],
+        ids: Int[np.ndarray, "N"],
+        time: float,
+        wrist: Float[np.ndarray, "7"] | None = None,
+    ) -> BodyFrame:
+        """Track the body among the finite points of the next frame; `wrist` is that of a forearm's hand."""
         # Copy, because read-only or non-contiguous arrays would compile a kernel anew.
         points, ids = np.array(points, dtype=np.float64, order="C"), np.array(ids, dtype=np.int64)
         cloud = _Cloud(points, ids, time, time - self._time)
@@ -219,7 +230,7 @@ class BodyTracker:
             if frame is not None:
                 return frame
             self._lose()
-        return self._initialize(cloud, self._carried(cloud))
+        return self._initialize(cloud, self._carried(cloud), wrist)
 
     def _reset(self) -> None:
         self._pose, self._velocity, self._time = np.full(7, np.nan), np.zeros(6), -np.inf  # of the last fit
@@ -282,8 +293,11 @@ class BodyTracker:
         is_kept = len(seen) > 1 and np.abs(apart).max() <= self._tolerances.kept
         return assignment if is_kept else np.full(len(assignment), -1)
 
-    def _initialize(self, cloud: _Cloud, carried: Integers) -> BodyFrame:
-        """Search the body near its predicted pose, then anywhere; a match of `carried` points is sure."""
+    def _initialize(self, cloud: _Cloud, carried: Integers, wrist: Doubles | None) -> BodyFrame:
+        """Search the body near its predicted pose, then anywhere.
+
+        `carried` points need no confirmation, and neither does a forearm that ends at its hand's `wrist`.
+        """
         if 0.0 < cloud.elapsed <= _LONGEST_PREDICTION:
             radius = self._search_radius(cloud.elapsed)
             match = self._match(cloud.points, self._predict(cloud.elapsed), radius)
@@ -291,7 +305,8 @@ class BodyTracker:
                 return self._accept(Status.INITIALIZED, match, cloud)
         match = self._match(cloud.points)
         if match.num_points >= FEWEST:
-            if ((match.assignment == carried) & (carried >= 0)).sum() > 1:
+            is_known = ((match.assignment == carried) & (carried >= 0)).sum() > 1
+            if is_known or (wrist is not None and self._ends_at(wrist, match.pose)):
                 return self._accept(Status.INITIALIZED, match, cloud)
             there = transform_markers(self._positions, match.pose)
             before = transform_markers(self._positions, self._candidate)
@@ -303,6 +318,14 @@ class BodyTracker:
         else:
             self._confirmed = 0
         return BodyFrame(Status.LOST, None, self._labels(carried, cloud.ids), np.nan)
+
+    def _ends_at(self, wrist: Doubles, pose: Doubles) -> bool:
+        """Whether the body at a pose is a forearm that ends at a hand's wrist, thumbs' sides alike."""
+        if self.template.forearm is None or not self.template.has_axes:
+            return False
+        thumbs = quaternion_matrix(np.stack([wrist[3:], pose[3:]]))[:, :, 1]
+        is_near = np.linalg.norm(wrist[:3] - pose[:3]) < _WRIST_RADIUS
+        return bool(is_near and thumbs[0] @ thumbs[1] > LEAST_ALIKE)
 
     def _predict(self, elapsed: float) -> Doubles:
         """Predict the pose after some time [s] with constant velocity."""
@@ -461,10 +484,11 @@ def _parse_body(table: Mapping[str, object]) -> RigidTemplate:
     name = _printable("the body's name", text_of(table, "name"))
     markers = [_parse_marker(entry, number) for number, entry in enumerate(tables_of(table, "marker"), 1)]
     positions = np.array([position for _, position in markers]).reshape(-1, 3)
-    limb = {part: cast("Side", text_of(table, part)) for part in ("forearm", "elbow") if part in table}
+    parts = ("forearm", "elbow")
+    forearm, elbow = (cast("Side", text_of(table, part)) if part in table else None for part in parts)
     axes, names = table.get("forearm_axes", False), tuple(marker for marker, _ in markers)
     check_type("forearm_axes", axes, bool, "true or false")
-    return RigidTemplate(name, names, 1e-3 * positions, None, has_axes=bool(axes), **limb)
+    return RigidTemplate(name, names, 1e-3 * positions, None, forearm, bool(axes), elbow)
 
 
 def _parse_marker(table: Mapping[str, object], number: int) -> tuple[str, list[float]]:

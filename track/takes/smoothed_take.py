@@ -103,8 +103,7 @@ def smooth_take(take: Take) -> Take:
             rms[fits, number] = hand.rms()[fits]
             angles[:, number], keypoints[:, number] = hand.angles, hand.keypoints
             if take.forearm_index(side) is not None:
-                calibrated = hand.model.is_calibrated
-                parts = wrist_variances(take, side, variances[:, -3:], is_calibrated=calibrated)
+                parts = wrist_variances(take, side, variances[:, -3:])
                 known = np.isfinite(parts).any(axis=(0, 2))
                 if known.any():
                     wrists[:, number] = np.sqrt(parts.sum(axis=-1))

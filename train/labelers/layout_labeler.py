@@ -210,10 +210,10 @@ def learned_labeler(layout: MarkerLayout, rig: CameraRig | str = "figure5") -> L
 
 @functools.lru_cache(maxsize=MAX_KEPT)
 def _digest(layout: MarkerLayout, rig: CameraRig | str) -> str:
-    """Digest of everything that a labeler depends on; of the layout as its file has it."""
-    saved = parse_layout(tomllib.loads("\n".join(layout_lines(layout))))
+    """Digest of everything that a labeler depends on; of the layout's hand as its file has it."""
+    saved = parse_layout(tomllib.loads("\n".join(layout_lines(dataclasses.replace(layout, forearm=())))))
     dependencies = {
-        "layout": dataclasses.asdict(saved),
+        "layout": saved.record(),
         "rig": load_rig(rig).record(),
         "weights": checksum(SHIPPED / WEIGHTS),
         "version": __version__,

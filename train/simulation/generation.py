@@ -155,7 +155,7 @@ def _record(source: FrameSource) -> dict[str, Any]:
     return {name: value for name, value in record.items() if name not in left_out} | {
         "rig": rig_setting(rig),
         "rig_digest": rig.digest(),  # releases may change a shipped rig
-        "layout": dataclasses.asdict(layout),
+        "layout": layout.record(),
     }
 
 

@@ -148,19 +148,22 @@ class SceneSight:
 
     @cached_property
     def markers(self) -> tuple[Float[np.ndarray, "T P 3"], Float[np.ndarray, "T P 3"]]:
-        """Centers [m] and outward unit directions of the hands' markers, then of the object's."""
+        """Centers [m] and outward unit directions of the hands' markers, the forearms', and the object's."""
         parts = [
             hand.fit.attachment.markers(hand.fit.model, bones)
             for hand, bones in zip(self.scene.hands, self.T_world_bone, strict=True)
         ]
         for part, moved in zip(parts, self.scene.skin, strict=False):
             part[0][:] += moved
+        bodies = [(arm.T_world_body, arm.body.positions, arm.normals) for arm in self.scene.forearms]
         held = self.scene.moving_object
         if held is not None:
-            pose, thing = held.T_world_body, held.rigid_object
+            thing = held.rigid_object
+            bodies.append((held.T_world_body, thing.markers, thing.marker_normals))
+        for pose, places, outward in bodies:
             rotation = pose[:, :3, :3]
-            centers = np.einsum("tij,qj->tqi", rotation, thing.markers) + pose[:, None, :3, 3]
-            parts.append((centers, np.einsum("tij,qj->tqi", rotation, thing.marker_normals)))
+            centers = np.einsum("tij,qj->tqi", rotation, places) + pose[:, None, :3, 3]
+            parts.append((centers, np.einsum("tij,qj->tqi", rotation, outward)))
         centers, normals = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
         return centers, normals
 
@@ -268,9 +271,13 @@ def _unlabeled_sources(
 
 
 def marker_radii(scene: SceneMotion, optics: OpticsConfig) -> Float[np.ndarray, "P"]:
-    """Radii of the hands' markers, then of the object's [m]; the optics may override those of the gloves."""
+    """Radii of the markers [m] as in `SceneSight.markers`; the optics may override those of the gloves."""
     layouts = [hand.fit.layout for hand in scene.hands]
     radii = [np.full(layout.num_markers, optics.radius_of(layout.radius)) for layout in layouts]
+    radii += [
+        np.full(len(arm.body.positions), optics.radius_of(layout.radius))
+        for arm, layout in zip(scene.forearms, layouts, strict=False)
+    ]
     if scene.moving_object is not None:
         radii.append(np.full(len(scene.moving_object.rigid_object.markers), MARKER_RADIUS))
     return np.concatenate(radii)
@@ -348,7 +355,8 @@ def record_take(
     ids[frame, column] = number_runs(present)[frame, source]
     truth[frame, column] = labels[frame, source]
     held = scene.moving_object
-    thing = None if held is None else held.rigid_object
+    bodies = [(arm.body, arm.T_world_body) for arm in scene.forearms]
+    bodies += [] if held is None else [(RigidBody.of(held.rigid_object), held.T_world_body)]
     return Take.of_truth(
         [hand.fit for hand in scene.hands],
         np.stack([hand.qpos for hand in scene.hands], axis=1),
@@ -356,8 +364,8 @@ def record_take(
         ids,
         truth,
         rate=scene.rate,
-        bodies=() if thing is None else (RigidBody.of(thing),),
-        body_poses=None if held is None else transform_poses(held.T_world_body)[:, None],
+        bodies=tuple(body for body, _ in bodies),
+        body_poses=np.stack([transform_poses(poses) for _, poses in bodies], axis=1) if bodies else None,
         settings=settings,
     )
 

@@ -5,19 +5,22 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal, get_args
+from typing import Annotated, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from gloves.fit import GlovedHand, GloveFit
+from gloves.fit import GlovedHand, GloveFit, forearm_markers
 from gloves.layout import MarkerLayout
+from gloves.takes.bodies import RigidBody
 from handsim.errors import ArgumentError, PoseError
 from handsim.hand.model import BodyMotion, HandModel, HandMotion, join_qpos
 from handsim.hand.shape import EVERYBODY, NUM_JOINTS, SIDES
 from handsim.settings import Limits, Settings
 from handsim.space.objects import named_object
+from handsim.space.transforms import pose_matrices
 from poses.motion import (
     RATE,
     MotionConfig,
@@ -83,8 +86,21 @@ _THING: Final = ((0.10, 0.0, -0.06), (0.14, 0.03, -0.09), (0.17, -0.02, -0.07), 
 _HEAD_MARKERS: Final = ((0.09, 0.0, 0.25), (-0.09, 0.0, 0.25), (0.0, 0.08, 0.27), (0.0, -0.08, 0.2))  # [m]
 _BACK_MARKERS: Final = ((-0.12, 0.05, -0.1), (-0.12, -0.05, -0.25))
 _OTHER_PERSON_DISTANCE: Final = 1.2  # [m] distance of the other person
+_GLUED: Final = 0.004  # [m] standard deviation of a forearm's markers from their layout, along each axis
+_BENDS: Final = np.array([0.1, 1.0, 0.4])  # shares of these turns that twist, flex and deviate a wrist
+_BENDING: Final = 0.3  # [rad] standard deviation of turns about each axis
 _SWAY: Final = 0.03  # [m] half side of the cube in which a swaying body stays
 _BODY_SIZE: Final = (0.3, 0.3, 0.7)  # [m] half sides of the box of the other person's markers
+
+
+class MovingForearm(NamedTuple):
+    """A forearm with markers, and where it is in each frame."""
+
+    body: RigidBody
+    normals: Float[np.ndarray, "Q 3"]
+    """Outward directions of the skin under its markers, in its frame."""
+    T_world_body: Float[np.ndarray, "T 4 4"]
+    """Poses [m]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,6 +115,8 @@ class SceneMotion:
     """Displacement of each hand's markers by its skin, in the world [m]; empty for none."""
     others: Float[np.ndarray, "T Q 3"] | None = None
     """Markers that belong to no hand and no tracked object [m]."""
+    forearms: tuple[MovingForearm, ...] = ()
+    """Forearms with markers."""
 
     @property
     def num_frames(self) -> int:
@@ -286,6 +304,24 @@ def _arm(
     frame = np.stack([-along, across, np.cross(along, across)], axis=2)
     places = np.array([*_WRIST_MARKERS, _ELBOW_MARKER, *_FOREARM_MARKERS])
     return np.asarray(wrist[:, None] + np.einsum("tij,kj->tki", frame, places))
+
+
+def sample_forearms(scene: SceneMotion, *, rng: np.random.Generator) -> tuple[MovingForearm, ...]:
+    """Forearms of the hands whose layout has markers there: wrists bend, and markers are glued freely."""
+    found = []
+    for hand in (one for one in scene.hands if one.fit.layout.forearm):
+        layout, side = hand.fit.layout, hand.side
+        positions, normals = forearm_markers(layout, hand.fit.shape.length, side)
+        glued = positions + rng.normal(scale=_GLUED, size=positions.shape)
+        names = tuple(one.name for one in layout.forearm)
+        body = RigidBody(f"{side}_forearm", names, glued, None, side, has_axes=True)
+        _, turned = wrist_path(scene.num_frames, scene.rate, turning=_BENDING, rng=rng)
+        turn = Rotation.from_quat(turned, scalar_first=True)
+        bends = Rotation.from_rotvec(_BENDS * (turn * turn[0].inv()).as_rotvec()).as_matrix()
+        poses = pose_matrices(hand.qpos[:, :7])
+        poses[:, :3, :3] @= bends.swapaxes(1, 2)
+        found.append(MovingForearm(body, normals, poses))
+    return tuple(found)
 
 
 def _slow_path(

@@ -39,6 +39,7 @@ from train.simulation.scenes import (
     SimulatedKind,
     other_markers,
     sample_calibration_scene,
+    sample_forearms,
     sample_real_like_scene,
     sample_scene_motion,
 )
@@ -132,6 +133,8 @@ def simulate_take(
         scene = scene.moved(np.subtract(given.center, ROOM_CENTER))
     if given.others:
         scene = dataclasses.replace(scene, others=other_markers(scene, given.others, rng=rng))
+    if layout.forearm:
+        scene = dataclasses.replace(scene, forearms=sample_forearms(scene, rng=rng))
     room = room_of(given)
     room = dataclasses.replace(room, optics=room.optics.worn(layout.radius))
     record = given.record() | {"rig": rig_setting(rig), "room": room.record()}

@@ -12,20 +12,23 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from gloves import Capture, Take, attach, load_take, write_capture
+from gloves import Capture, Take, attach, load_layout, load_take, write_capture
+from gloves.fit import forearm_markers
+from gloves.takes.points import Status
 from handsim import HandModel, sample_shape
 from handsim.cli.main import main
 from handsim.errors import ArgumentError, CalibrationError
 from handsim.hand.angles import WRIST_NAMES
-from handsim.space.transforms import MIRROR, random_quaternions, rotation_quaternions
+from handsim.space.transforms import MIRROR, pose_matrices, random_quaternions, rotation_quaternions
 from poses import sample_motion
 from render.user_body import UserBody
-from track import RigidTemplate, track_capture
-from track.bodies.forearm import limb_of_landmarks
-from track.bodies.rigid_body import learn_body, load_bodies, load_body, save_body
+from track import RigidTemplate, calibrate, label_capture, track_capture
+from track.bodies.forearm import found_forearm, limb_of_landmarks, wrist_variances
+from track.bodies.rigid_body import BodyTracker, learn_body, load_bodies, load_body, save_body
 from track.takes.take_faults import find_faults
 from track.takes.take_figures import PageSettings
 from track.takes.take_page import write_take_page
+from train import simulate_take
 from train.simulation.training_frames import wear_gloves
 
 RATE = 120.0
@@ -153,6 +156,26 @@ def test_stated_deviations_of_measured_hands_hold():
         whole = np.concatenate([ratio[:, columns].ravel() for ratio in ratios])
         whole = whole[np.isfinite(whole)]
         assert once[0] < (whole < 1.0).mean() < once[1] and twice[0] < (whole < 2.0).mean() < twice[1]
+
+
+def test_gluing_and_person_of_a_palm_count_less_as_its_markers_are_many():
+    take = tracked("right")
+    parts = wrist_variances(take, "right", np.ones((take.num_frames, 3, 5)))[:, :2]
+    np.testing.assert_allclose(np.nanmean(parts, axis=(0, 1))[1:], [0.36, 1.0, 0.36, 1.0])
+
+
+@pytest.mark.slow
+def test_stated_deviations_of_calibrated_hands_hold():
+    ratios = []
+    for person, side in enumerate(("left", "right") * 2, 101):
+        one = scene(side, 2400, person)
+        user = calibrate(one.capture, glove="dense19", hands=(side,))
+        take = track_capture(one.capture, hands=user, bodies=[one.arm])
+        off = (wrist_of(take) - one.angles)[:, :2]
+        spreads = np.transpose([take.angle_spreads(side)[name] for name in WRIST_NAMES[:2]])
+        ratios.append(np.abs(off / spreads)[np.isfinite(off).all(axis=1)].ravel())
+    whole = np.concatenate(ratios)
+    assert 0.6 < (whole < 1.0).mean() < 0.8 and 0.92 < (whole < 2.0).mean() < 0.99
 
 
 def test_every_label_of_the_arm_is_right():
@@ -315,3 +338,95 @@ def test_arms_in_pictures_follow_the_forearm():
     take = scene("right").truth
     axes = Rotation.from_quat(take.body_poses[:, 0, 3:], scalar_first=True).as_matrix()
     np.testing.assert_allclose(UserBody(take).forearms[:, 0], -axes[..., 0], atol=1e-9)
+
+
+@functools.cache
+def worn_forearm(side: str) -> tuple[Take, Take, Take]:
+    """A simulated take in a glove whose layout has a forearm, labeled and tracked from its points alone."""
+    glove = dataclasses.replace(load_layout("dense19"), forearm=load_layout("clinical26").forearm)
+    truth = simulate_take("free", glove=glove, hands=(side,), num_frames=360, seed=5)
+    names = tuple(f"u{column}" for column in range(truth.points.shape[1]))
+    options = {"glove": glove, "labeler": "dense19", "hands": (side,)}
+    capture = Capture(names, truth.points, truth.rate)
+    return truth, label_capture(capture, **options), track_capture(capture, **options)
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_forearm_of_a_layout_is_found_among_points_without_names(side):
+    truth, labeled, take = worn_forearm(side)
+    assert truth.label_names == labeled.label_names == take.label_names
+    beyond = truth.labels >= truth.hand_labels[-1].stop
+    for one in (labeled, take):
+        assert one.bodies[0].forearm == side and one.bodies[0].is_nominal
+        assert (one.labels == truth.labels)[beyond].mean() > 0.995
+        assert (one.labels == truth.labels)[truth.labels >= 0].mean() > 0.995
+    arms = [np.linalg.norm(np.diff(one.bodies[0].positions, axis=0), axis=1) for one in (truth, take)]
+    np.testing.assert_allclose(*arms, atol=5e-4)
+    names = labeled.labeled_capture(sides=False).names
+    assert names[: 19 + 4] == (*load_layout("dense19").names, *truth.bodies[0].marker_names)
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_wrist_beside_a_forearm_of_a_layout_knows_how_well(side, tmp_path):
+    truth, _, take = worn_forearm(side)
+    off = (wrist_of(take) - wrist_of(truth))[:, :2]
+    spreads = np.transpose([take.angle_spreads(side)[name] for name in WRIST_NAMES[:2]])
+    assert np.nanmax(np.abs(off / spreads)) < 3.0 and np.rad2deg(np.nanstd(off, axis=0)).max() < 1.0
+    assert np.rad2deg(np.nanmedian(spreads)) > 2.0, "axes of a layout are known no better than it is glued"
+    take.save(tmp_path / "take.npz")
+    again = load_take(tmp_path / "take.npz")
+    assert again.bodies[0].is_nominal and again.hands[0].layout.forearm == take.hands[0].layout.forearm
+
+
+def test_a_forearm_that_is_given_or_not_there_is_not_looked_for(rng):
+    truth, _, take = worn_forearm("right")
+    glove, names = take.hands[0].layout, tuple(f"u{column}" for column in range(truth.points.shape[1]))
+    options = {"glove": glove, "labeler": "dense19", "hands": ("right",)}
+    own = RigidTemplate("own", truth.bodies[0].marker_names, truth.bodies[0].positions, None, "right")
+    given = track_capture(Capture(names, truth.points, truth.rate), bodies=[own], **options)
+    assert [body.name for body in given.bodies] == ["own"]
+    hand = np.where((truth.labels < truth.hand_labels[-1].stop)[..., None], truth.points, np.nan)
+    with pytest.warns(UserWarning, match="the right forearm is not found, expected RadialStyloid"):
+        bare = label_capture(Capture(names, hand, truth.rate), **options)
+    assert (
+        not bare.bodies
+        and (bare.labels == np.where(np.isfinite(hand[..., 0]), truth.labels, -1)).mean() > 0.99
+    )
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_a_forearm_of_three_markers_at_its_hand_needs_no_confirmation(side):
+    one = scene(side)
+    positions = one.arm.positions[:3] * [[1.0], [1.0], [1.2]]  # that look different from two sides
+    arm = dataclasses.replace(one.arm, marker_names=NAMES[:3], positions=positions)
+    poses = pose_matrices(one.truth.body_poses[:, 0])
+    points = np.einsum("tij,mj->tmi", poses[:, :3, :3], positions) + poses[:, None, :3, 3]
+    ids = np.arange(3)
+    alone, beside, wrong = BodyTracker(arm), BodyTracker(arm), BodyTracker(arm)
+    wrist = one.truth.qpos[:, 0, :7]
+    away = wrist + [0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    for frame in range(9):
+        assert alone.step(points[frame], ids, frame / RATE).status == Status.LOST
+        assert wrong.step(points[frame], ids, frame / RATE, away[frame]).status == Status.LOST
+        found = beside.step(points[frame], ids, frame / RATE, wrist[frame])
+        np.testing.assert_array_equal(found.labels, [0, 1, 2])
+    plain = BodyTracker(dataclasses.replace(arm, has_axes=False))
+    assert plain.step(points[0], ids, 0.0, wrist[0]).status == Status.LOST, "nobody knows where it ends"
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_points_of_a_forearm_are_told_from_others_beside_it(side, rng):
+    layout = load_layout("clinical26")
+    positions, _ = forearm_markers(layout, 0.19, side)
+    names = tuple(one.name for one in layout.forearm)
+    nominal = RigidTemplate("arm", names, positions, None, side, has_axes=True)
+    glued = positions + rng.normal(scale=0.003, size=positions.shape)
+    turns = Rotation.from_rotvec(rng.normal(size=(30, 3)) * [0.05, 0.5, 0.2]).as_matrix()
+    clouds = [
+        rng.permutation(np.concatenate([glued @ turn.T, rng.uniform(-0.2, 0.2, (6, 3))])) for turn in turns
+    ]
+    found = found_forearm(nominal, np.tile(np.eye(4), (30, 1, 1)), clouds)
+    apart = [np.linalg.norm(one[:, None] - one, axis=2) for one in (found.positions, glued)]
+    np.testing.assert_allclose(*apart, atol=1e-4)
+    loose = [cloud + rng.normal(scale=0.02, size=cloud.shape) for cloud in clouds]
+    assert found_forearm(nominal, np.tile(np.eye(4), (30, 1, 1)), loose) is None
