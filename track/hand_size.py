@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import warnings
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -32,8 +32,6 @@ from track.association.initialization import HandInitializer, distances_to_neare
 from track.calibration.energy import (
     QUICK_GAIN,
     QUICK_OPTIONS,
-    Estimate,
-    Problem,
     eliminate_poses,
     first_estimate,
     levenberg_marquardt,
@@ -97,18 +95,24 @@ _MOST_OWN: Final = 16  # largest number of tried gloves of the working folder
 class SizeFit(NamedTuple):
     """Measured hands."""
 
-    hand: GloveFit  # the right one; a left hand is its mirror image
-    rms: float  # median RMS distance of the markers from this hand [m]
-    spread: float  # standard deviation of its length [m]
+    worn: dict[Side, GloveFit]  # those that were seen, of one shape
+    rms: float  # median RMS distance of the markers from their hands [m]
+    spread: float  # standard deviation of the hands' length [m]
+
+    @property
+    def shape(self) -> HandShape:
+        """The shape of a hand; that of the other is its mirror image."""
+        return next(iter(self.worn.values())).shape
 
     def __str__(self) -> str:
         """Length and breadth, and the 95 % uncertainty of the length [mm]."""
-        shape, unsure = self.hand.shape, _SURE * self.spread
+        shape, unsure = self.shape, _SURE * self.spread
         return f"{1e3 * shape.length:.0f} x {1e3 * shape.breadth:.0f} mm, unsure by {1e3 * unsure:.0f} mm"
 
     def hands(self, sides: Sequence[Side]) -> tuple[GloveFit, ...]:
-        """The measured hands of the given sides."""
-        return tuple(self.hand.with_side(side) for side in sides)
+        """The measured hands of the given sides; one that was not seen is the mirror image of the other."""
+        some = next(iter(self.worn.values()))
+        return tuple(self.worn.get(side, some).with_side(side) for side in sides)
 
 
 def sample_frames(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
@@ -136,7 +140,7 @@ def fit_size(
     for config in (_LENIENT,) if is_quick else (_USUAL, _LENIENT):
         rated: list[tuple[float, SizeFit]] = []
         for length in _LENGTHS[:2] if is_quick else _LENGTHS:
-            if any(length > fit.hand.shape.length for _, fit in rated):
+            if any(length > fit.shape.length for _, fit in rated):
                 continue
             fit = _fit_from(length, frames, layout, sides, labeler, config)
             if fit is None or not (config is _USUAL or _is_found(fit, frames, sides, labeler)):
@@ -187,22 +191,23 @@ def _fit_from(
     config: TrackerConfig,
 ) -> SizeFit | None:
     """Measure hands that are first labeled as hands of a given length [m]."""
-    markers: list[NDArray[np.float64]] = []
+    markers: dict[Side, NDArray[np.float64]] = {}
     for _ in range(2):  # Labels improve with hands of about their own size.
         start = mean_hand(length, usual_breadth(length), layout)
         markers = _label(frames, start, sides, labeler, config) or markers
         if not markers:
             return None
-        search, before = _Search(markers, start), length
+        search, before = _Search(list(markers.values()), start), length
         length = search.length(usual_breadth, _SHORTEST, _LONGEST)
         if abs(length - before) <= _FAR:
             break
-    return _fit_proportions(np.concatenate(markers), mean_hand(*search.measures(length), layout))
+    return _fit_proportions(markers, mean_hand(*search.measures(length), layout))
 
 
 def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:
     """Whether measured hands are found in most frames, or in some where most markers fit well."""
-    tracker, count = Tracker(fit.hands(sides), labeler), fit.hand.layout.num_markers
+    hands = fit.hands(sides)
+    tracker, count = Tracker(hands, labeler), hands[0].layout.num_markers
     enough = [frame for frame in frames if _are_enough(frame, count)]
     tracked = [tracker.step(frame.points, frame.ids, frame.time).hands for frame in enough]
     if sum(any(hand.has_pose for hand in hands) for hands in tracked) >= max(1.0, _LEAST_SHARE * len(enough)):
@@ -236,7 +241,7 @@ def _label(
     sides: Sequence[Side],
     labeler: Labeler,
     config: TrackerConfig,
-) -> list[Float[np.ndarray, "F M 3"]]:
+) -> dict[Side, Float[np.ndarray, "F M 3"]]:
     """Labeled markers [m] of each hand shown often enough, mirrored to a right hand, NaN where missing."""
     tracker = Tracker([hand.with_side(side) for side in sides], labeler, config=config)
     count = hand.layout.num_markers
@@ -251,11 +256,11 @@ def _label(
                 markers = seen.markers.copy()
                 markers[seen.filled] = np.nan
                 some.append(markers)
-    return [
-        spread_out(np.array(some), _PROPORTION_FRAMES) @ (MIRROR if side == "left" else np.eye(3))
+    return {
+        side: spread_out(np.array(some), _PROPORTION_FRAMES) @ (MIRROR if side == "left" else np.eye(3))
         for side, some in zip(sides, found, strict=True)
         if len(some) >= _FEWEST
-    ]
+    }
 
 
 class _Search:
@@ -297,19 +302,25 @@ def _least(function: Callable[[float], float], low: float, high: float) -> float
     return float(minimize_scalar(function, bounds=(low, high), method="bounded", options=options).x)
 
 
-def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:
-    """Fit one shape to right hands in some frames, by a calibration without touches."""
-    problem, estimate = _first_proportions(seen, start)
+def _fit_proportions(markers: Mapping[Side, Float[np.ndarray, "F M 3"]], start: GloveFit) -> SizeFit:
+    """Fit right hands of one shape, each with its own places of markers, by a calibration without touches."""
+    count, ends = start.layout.num_markers, np.cumsum([len(seen) for seen in markers.values()])
+    # One problem has the markers of all hands as columns, missing in the frames of other hands.
+    columns = np.full((ends[-1], len(markers) * count, 3), np.nan)
+    for hand, (stop, seen) in enumerate(zip(ends, markers.values(), strict=True)):
+        columns[stop - len(seen) : stop, hand * count : (hand + 1) * count] = seen
+    solved = PoseSolver(start).solve(np.concatenate(list(markers.values())))
+    problem, estimate = first_estimate(start, columns, solved.qpos, **QUICK_OPTIONS)
     estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, QUICK_GAIN)
-    hand = user_hand(start, problem, estimate)
-    rms = float(np.median(PoseSolver(hand).solve(seen, estimate.qpos).rms))
+    worn, rms = dict[Side, GloveFit](), list[NDArray[np.float64]]()
+    for hand, (stop, (side, seen)) in enumerate(zip(ends, markers.items(), strict=True)):
+        places = estimate.coordinates.part(hand * count, (hand + 1) * count)
+        right = user_hand(start, problem, dataclasses.replace(estimate, coordinates=places))
+        rms.append(PoseSolver(right).solve(seen, estimate.qpos[stop - len(seen) : stop]).rms)
+        worn[side] = right.with_side(side)
     variance = shared_covariance(problem, estimate, fit)[0][LENGTH, LENGTH]
-    return SizeFit(hand, rms, hand.shape.length * float(np.sqrt(variance)))
-
-
-def _first_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> tuple[Problem, Estimate]:
-    """The problem of one shape of right hands in some frames, and the start as first estimate."""
-    return first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **QUICK_OPTIONS)
+    length = next(iter(worn.values())).shape.length
+    return SizeFit(worn, float(np.median(np.concatenate(rms))), length * float(np.sqrt(variance)))
 
 
 def glove_shifts(
@@ -325,7 +336,8 @@ def glove_shifts(
         worn: The hand as tracked.
     """
     right = worn.with_side("right")
-    problem, estimate = _first_proportions(seen @ (MIRROR if worn.side == "left" else np.eye(3)), right)
+    seen = seen @ (MIRROR if worn.side == "left" else np.eye(3))
+    problem, estimate = first_estimate(right, seen, PoseSolver(right).solve(seen).qpos, **QUICK_OPTIONS)
     estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FEW_STEPS, None, QUICK_GAIN)
     _, by_shared, residuals, _ = jacobians = problem.weighted_jacobians(estimate, fit)
     equations = problem.normal_equations(estimate, fit, jacobians)

@@ -402,11 +402,16 @@ class Problem:
 def first_estimate(
     hand: GloveFit, targets: Float[np.ndarray, "F M 3"], qpos: Float[np.ndarray, "F 27"], **options: Any
 ) -> tuple[Problem, Estimate]:
-    """The problem of a right hand's labeled markers [m] with its options, and the hand as first estimate."""
-    worn = hand.attachment
-    coordinates = nearest_coordinates(worn.points, worn.feet, worn.main_bones, hand.shape)
-    problem = Problem(hand.shape, coordinates, worn.layout.heights, targets, **options)
-    return problem, Estimate(np.zeros(NUM_PARAMETERS), worn.points, coordinates, qpos)
+    """The problem of a right hand's labeled markers [m] with its options, and the hand as first estimate.
+
+    Targets may have the markers of several such hands, one after the other, with places of their own.
+    """
+    worn, copies = hand.attachment, targets.shape[1] // hand.layout.num_markers
+    one = nearest_coordinates(worn.points, worn.feet, worn.main_bones, hand.shape)
+    coordinates = SkinCoordinates(*(np.concatenate([values] * copies) for values in one))
+    heights, points = np.tile(worn.layout.heights, copies), np.tile(worn.points, (copies, 1))
+    problem = Problem(hand.shape, coordinates, heights, targets, **options)
+    return problem, Estimate(np.zeros(NUM_PARAMETERS), points, coordinates, qpos)
 
 
 class ContactGeometry(NamedTuple):
