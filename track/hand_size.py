@@ -164,7 +164,10 @@ def measured_user(
     if size is not None:
         return User(size.hands(user.sides), f"{MEASURED}{size}")
     if warns:
-        none = f"no hand was found to measure its size; size {user.notes} is used, or name a size"
+        none = (
+            f"no hand was found to measure its size, in {_FEWEST} frames with most of its markers; size "
+            f"{user.notes} is used, or name a size"
+        )
         warnings.warn(none, HandSimWarning, stacklevel=3)
     return user
 

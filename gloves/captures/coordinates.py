@@ -121,7 +121,7 @@ def _without_stand_ins(capture: Capture) -> tuple[Capture, int, int]:
 
     Some programs write zeros for what was not seen, -1 or 9999 three times, or (0, 0, -1). A measured point
     never has one number in all coordinates twice, and markers do not jump again and again to one place that
-    none moves to; a capture in which nothing moves is left as it is.
+    none moves to. A capture in which nothing moves is left as it is, if no two points of a frame are alike.
     """
     positions = capture.positions
     equal = (positions == positions[..., :1]).all(axis=-1)
@@ -138,7 +138,10 @@ def _without_stand_ins(capture: Capture) -> tuple[Capture, int, int]:
     stands = equal | (np.isin(keys, places) & (capture.num_frames >= _MIN_FRAMES))
     there = np.isfinite(positions[..., 0]) & ~stands
     tracks = (positions[there[:, column], column] for column in range(positions.shape[1]))
-    if not stands.any() or not any((track != track[:1]).any() for track in tracks):  # nothing moves
+    # two markers are never at one place; a file of nothing else is refused elsewhere
+    alike = bool(there.any()) and int(equal.sum(axis=1).max(initial=0)) > 1
+    moves = any((track != track[:1]).any() for track in tracks)
+    if not stands.any() or not (alike or moves):
         return capture, 0, 0
     zeros = int((equal & (positions[..., 0] == 0.0)).sum())
     missing = np.where(stands[..., None], np.nan, positions)

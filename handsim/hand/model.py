@@ -85,6 +85,8 @@ _AT_LIMIT: Final = 1e-9  # [rad] A metacarpal that is this near its limit does n
 _MAX_FRAMES: Final = 1 << 22
 _STEADY: Final = 0.01  # largest deviation of times from a steady rate, in frames
 _MAX_GAP: Final = 0.1  # [s] that interpolation bridges
+_FARTHEST: Final = 50.0  # largest coordinate of a wrist [m]
+_WIDEST: Final = 2.0 * np.pi  # largest joint angle [rad]
 _MAX_GAP_FRAMES: Final = 2.5  # old frames that interpolation bridges, if that is longer
 
 
@@ -347,6 +349,20 @@ def join_qpos(
     qpos[:, 3:7] = (1.0, 0.0, 0.0, 0.0) if quaternion is None else quaternion
     qpos[:, 7:] = angles
     return qpos
+
+
+def check_bounds(qpos: Float[np.ndarray, "*T 27"]) -> None:
+    """Refuse poses in millimeters or degrees, which lie beyond any room or turn; NaN is no pose."""
+    farthest, widest = (np.nanmax(np.abs(some), initial=0.0) for some in (qpos[..., :3], qpos[..., 7:]))
+    if farthest > _FARTHEST:
+        raise ArgumentError(
+            f"a wrist is {farthest:.4g} m from the origin along an axis, expected at most {_FARTHEST:g}; are "
+            "these millimeters?"
+        )
+    if widest > _WIDEST:
+        raise ArgumentError(
+            f"a joint angle is {widest:.4g} rad, expected at most {_WIDEST:.3f}; are these degrees?"
+        )
 
 
 def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 21 3"]:
