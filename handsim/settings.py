@@ -189,6 +189,9 @@ def _checked_object(name: str, value: Any, kind: Any, expected: Expected | None)
     """A value of one type; a path may be a string, and a protocol is anything with its public members."""
     if kind is Path and isinstance(value, str):
         return Path(value)
+    if get_origin(kind) is Mapping:
+        check_type(name, value, Mapping, "names with their values")
+        return {key: _checked_value(f"{name}: {key}", item, get_args(kind)[1]) for key, item in value.items()}
     if getattr(kind, "_is_protocol", False):
         if not all(hasattr(value, member) for member in _members(kind)):
             raise unexpected(name, value, _type_words(kind, expected))

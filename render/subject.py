@@ -22,7 +22,7 @@ from handsim._checks import as_array, as_numbers, check_choice, check_count, che
 from handsim.errors import ArgumentError, CaptureError, HandSimError, HandSimWarning, choices, errors_of
 from handsim.files.arrays import read_npz
 from handsim.files.inputs import check_regular, checksum
-from handsim.hand.model import HandModel, join_qpos, load_model
+from handsim.hand.model import HandModel, check_bounds, join_qpos, load_model
 from handsim.hand.shape import (
     HAND_DTYPE,
     NUM_JOINTS,
@@ -45,7 +45,6 @@ KEYS: Final = ("qpos", "angles", "T_world_wrist", "times", "person", "hands", "h
 CSV: Final = ".csv"
 MOST_PEOPLE: Final = 1_000_000
 _MOST_FRAMES: Final = 10_000_000
-_FARTHEST_WRIST: Final = 50.0  # largest coordinate of a wrist [m]
 _RANGE_TOLERANCE: Final = np.deg2rad(10.0)  # angle beyond a joint's range from which on users are warned
 _POSE_INTERVAL: Final = 1.0  # time between frames without times, which are poses without a motion [s]
 
@@ -107,7 +106,7 @@ def _stored_qpos(arrays: Mapping[str, NDArray[Any]], count: int) -> Float[np.nda
     qpos[lost] = np.nan
     if lost.all():
         raise ArgumentError("there is no hand in any frame, expected one to draw")
-    _check_bounds(qpos)
+    check_bounds(qpos)
     qpos[..., 3:7] /= np.linalg.norm(qpos[..., 3:7], axis=-1, keepdims=True)
     return qpos
 
@@ -139,19 +138,6 @@ def _checked_wrists(arrays: Mapping[str, NDArray[Any]], count: int) -> Doubles:
     if bad.any():
         raise ArgumentError(f"T_world_wrist is not a rigid transform in frame {np.argwhere(bad)[0][0]}")
     return poses
-
-
-def _check_bounds(qpos: Doubles) -> None:
-    farthest, widest = np.nanmax(np.abs(qpos[..., :3])), np.nanmax(np.abs(qpos[..., 7:]))
-    if farthest > _FARTHEST_WRIST:
-        raise ArgumentError(
-            f"a wrist is {farthest:.4g} m from the origin along an axis, expected at most "
-            f"{_FARTHEST_WRIST:g}; are these millimeters?"
-        )
-    if widest > np.pi:
-        raise ArgumentError(
-            f"a joint angle is {widest:.4g} rad, expected at most {np.pi:.3f}; are these degrees?"
-        )
 
 
 def _warn_of_ranges(name: str, qpos: Doubles) -> None:

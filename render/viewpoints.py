@@ -21,7 +21,7 @@ from handsim.errors import ArgumentError, HandSimWarning, RigError
 from handsim.hand.model import hand_keypoints
 from handsim.settings import Limits, Settings
 from handsim.space.camera import Camera, look_at, preset
-from handsim.space.rig import load_rig
+from handsim.space.rig import check_near, load_rig
 from handsim.space.rig_formats import load_cameras
 from handsim.space.transforms import UpAxis, quaternion_matrix, rigid, room_axes
 from render.arms import MOST_HIDDEN, SeenHands
@@ -257,6 +257,8 @@ class ViewConfig(Settings):
             )
         if self.cameras == ():
             raise ArgumentError("cameras is empty, expected at least one camera")
+        for one in self.cameras if isinstance(self.cameras, tuple) else ():
+            check_near(f"camera '{one.name}'", one)
 
     @property
     def cameras_name(self) -> str:

@@ -330,8 +330,8 @@ def measure_hands(
         hands: Which hands; all that the glove is made for when not given.
 
     Returns:
-        The hands, all of one shape; `str()` gives their length and breadth. If no hand is found that
-        shows most of its markers, hands of size M, with a warning.
+        The hands, all of one shape, each with the places of its own markers; `str()` gives their length
+        and breadth. If no hand is found that shows most of its markers, hands of size M, with a warning.
 
     Raises:
         ArgumentError: The capture is not in meters, or a hand is named twice.

@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import warnings
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -31,8 +31,6 @@ from track.association.initialization import HandInitializer, distances_to_neare
 from track.calibration.energy import (
     QUICK_GAIN,
     QUICK_OPTIONS,
-    Estimate,
-    Problem,
     eliminate_poses,
     first_estimate,
     levenberg_marquardt,
@@ -100,17 +98,24 @@ _MOST_FOLDER_GLOVES: Final = 16  # largest number of tried gloves of the working
 class SizeFit(NamedTuple):
     """Measured hands."""
 
-    hand: GloveFit  # the right hand; a left hand is its mirror image
-    rms: float  # median RMS distance of the markers from this hand [m]
-    spread: float  # standard deviation of its length [m]
+    worn: dict[Side, GloveFit]  # those that were seen, of one shape
+    rms: float  # median RMS distance of the markers from their hands [m]
+    spread: float  # standard deviation of the hands' length [m]
+
+    @property
+    def shape(self) -> HandShape:
+        """The shape of a hand; that of the other is its mirror image."""
+        return next(iter(self.worn.values())).shape
 
     def __str__(self) -> str:
         """Length and breadth, and the 95 % uncertainty of the length [mm]."""
-        return f"{size_words(self.hand)}, unsure by {1e3 * _INTERVAL_95 * self.spread:.0f} mm"
+        hand = next(iter(self.worn.values()))
+        return f"{size_words(hand)}, unsure by {1e3 * _INTERVAL_95 * self.spread:.0f} mm"
 
     def hands(self, sides: Sequence[Side]) -> tuple[GloveFit, ...]:
-        """The measured hands of the given sides."""
-        return tuple(self.hand.with_side(side) for side in sides)
+        """The measured hands of the given sides; one that was not seen is the mirror image of the other."""
+        some = next(iter(self.worn.values()))
+        return tuple(self.worn.get(side, some).with_side(side) for side in sides)
 
 
 def sample_frames(frames: Sequence[StreamedFrame]) -> list[StreamedFrame]:
@@ -138,7 +143,7 @@ def fit_size(
     for config in (_LENIENT_CONFIG,) if is_quick else (_USUAL_CONFIG, _LENIENT_CONFIG):
         rated: list[tuple[float, SizeFit]] = []
         for length in _TRIED_LENGTHS[:2] if is_quick else _TRIED_LENGTHS:
-            if any(length > fit.hand.shape.length for _, fit in rated):
+            if any(length > fit.shape.length for _, fit in rated):
                 continue
             fit = _fit_from(length, frames, layout, sides, labeler, config)
             if fit is None or not (config is _USUAL_CONFIG or _is_found(fit, frames, sides, labeler)):
@@ -162,7 +167,10 @@ def measured_user(
     if size is not None:
         return User(size.hands(user.sides), f"{MEASURED}{size}")
     if warns:
-        none = f"no hand was found to measure its size; size {user.notes} is used, or name a size"
+        none = (
+            f"no hand was found to measure its size, in {_FEWEST_FRAMES} frames with most of its markers; "
+            f"size {user.notes} is used, or name a size"
+        )
         warnings.warn(none, HandSimWarning, stacklevel=3)
     return user
 
@@ -189,22 +197,23 @@ def _fit_from(
     config: TrackerConfig,
 ) -> SizeFit | None:
     """Measure hands that are first labeled as hands of a given length [m]."""
-    markers: list[Doubles] = []
+    markers: dict[Side, Doubles] = {}
     for _ in range(2):  # Labels improve once the hands are of about the right size.
         start = mean_hand(length, usual_breadth(length), layout)
         markers = _labeled_markers(frames, start, sides, labeler, config) or markers
         if not markers:
             return None
-        search, before = _Search(markers, start), length
+        search, before = _Search(list(markers.values()), start), length
         length = search.length(usual_breadth, _SHORTEST, _LONGEST)
         if abs(length - before) <= _RELABELED_CHANGE:
             break
-    return _fit_proportions(np.concatenate(markers), mean_hand(*search.measures(length), layout))
+    return _fit_proportions(markers, mean_hand(*search.measures(length), layout))
 
 
 def _is_found(fit: SizeFit, frames: Sequence[StreamedFrame], sides: Sequence[Side], labeler: Labeler) -> bool:
     """Whether measured hands are found in most frames, or in some where most markers fit well."""
-    tracker, count = Tracker(fit.hands(sides), labeler), fit.hand.layout.num_markers
+    hands = fit.hands(sides)
+    tracker, count = Tracker(hands, labeler), hands[0].layout.num_markers
     enough = [frame for frame in frames if _are_enough(frame, count)]
     tracked = [tracker.step(frame.points, frame.ids, frame.time).hands for frame in enough]
     num_found = sum(any(hand.has_pose for hand in hands) for hands in tracked)
@@ -239,7 +248,7 @@ def _labeled_markers(
     sides: Sequence[Side],
     labeler: Labeler,
     config: TrackerConfig,
-) -> list[Float[np.ndarray, "F M 3"]]:
+) -> dict[Side, Float[np.ndarray, "F M 3"]]:
     """Labeled markers [m] of each hand shown often enough, mirrored to a right hand, NaN where missing."""
     tracker = Tracker([hand.with_side(side) for side in sides], labeler, config=config)
     count = hand.layout.num_markers
@@ -252,8 +261,11 @@ def _labeled_markers(
         for seen, some in zip(tracker.step(frame.points, frame.ids, frame.time).hands, found, strict=True):
             if _is_shown(seen, count):
                 some.append(seen.seen_markers)
-    shown = [(side, some) for side, some in zip(sides, found, strict=True) if len(some) >= _FEWEST_FRAMES]
-    return [spread_out(np.array(some), _PROPORTION_FRAMES) @ mirror_to_right(side) for side, some in shown]
+    return {
+        side: spread_out(np.array(some), _PROPORTION_FRAMES) @ mirror_to_right(side)
+        for side, some in zip(sides, found, strict=True)
+        if len(some) >= _FEWEST_FRAMES
+    }
 
 
 class _Search:
@@ -295,19 +307,25 @@ def _minimize(function: Callable[[float], float], low: float, high: float) -> fl
     return float(minimize_scalar(function, bounds=(low, high), method="bounded", options=options).x)
 
 
-def _fit_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> SizeFit:
-    """Fit one shape to right hands in some frames, by a calibration without touches."""
-    problem, estimate = _first_proportions(seen, start)
+def _fit_proportions(markers: Mapping[Side, Float[np.ndarray, "F M 3"]], start: GloveFit) -> SizeFit:
+    """Fit right hands of one shape, each with its own places of markers, by a calibration without touches."""
+    count, ends = start.layout.num_markers, np.cumsum([len(seen) for seen in markers.values()])
+    # One problem has the markers of all hands as columns, missing in the frames of other hands.
+    columns = np.full((ends[-1], len(markers) * count, 3), np.nan)
+    for hand, (stop, seen) in enumerate(zip(ends, markers.values(), strict=True)):
+        columns[stop - len(seen) : stop, hand * count : (hand + 1) * count] = seen
+    solved = PoseSolver(start).solve(np.concatenate(list(markers.values())))
+    problem, estimate = first_estimate(start, columns, solved.qpos, **QUICK_OPTIONS)
     estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FIT_STEPS, None, QUICK_GAIN)
-    hand = user_hand(start, problem, estimate)
-    rms = float(np.median(PoseSolver(hand).solve(seen, estimate.qpos).rms))
+    worn, rms = dict[Side, GloveFit](), list[Doubles]()
+    for hand, (stop, (side, seen)) in enumerate(zip(ends, markers.items(), strict=True)):
+        places = estimate.coordinates.part(hand * count, (hand + 1) * count)
+        right = user_hand(start, problem, dataclasses.replace(estimate, coordinates=places))
+        rms.append(PoseSolver(right).solve(seen, estimate.qpos[stop - len(seen) : stop]).rms)
+        worn[side] = right.with_side(side)
     variance = shared_covariance(problem, estimate, fit)[0][LENGTH, LENGTH]
-    return SizeFit(hand, rms, hand.shape.length * float(np.sqrt(variance)))
-
-
-def _first_proportions(seen: Float[np.ndarray, "F M 3"], start: GloveFit) -> tuple[Problem, Estimate]:
-    """The problem of one shape of right hands in some frames, and the start as first estimate."""
-    return first_estimate(start, seen, PoseSolver(start).solve(seen).qpos, **QUICK_OPTIONS)
+    length = next(iter(worn.values())).shape.length
+    return SizeFit(worn, float(np.median(np.concatenate(rms))), length * float(np.sqrt(variance)))
 
 
 def glove_shifts(
@@ -323,7 +341,8 @@ def glove_shifts(
         worn: The hand as tracked.
     """
     right = worn.with_side("right")
-    problem, estimate = _first_proportions(seen @ mirror_to_right(worn.side), right)
+    seen = seen @ mirror_to_right(worn.side)
+    problem, estimate = first_estimate(right, seen, PoseSolver(right).solve(seen).qpos, **QUICK_OPTIONS)
     estimate, fit, _ = levenberg_marquardt(problem, estimate, 0, _FEW_STEPS, None, QUICK_GAIN)
     _, by_shared, residuals, _ = jacobians = problem.weighted_jacobians(estimate, fit)
     equations = problem.normal_equations(estimate, fit, jacobians)

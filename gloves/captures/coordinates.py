@@ -124,7 +124,8 @@ def _without_stand_ins(capture: Capture) -> tuple[Capture, int, int]:
 
     Some programs write (0, 0, 0), (-1, -1, -1), (9999, 9999, 9999) or (0, 0, -1) for a missing point. A
     measured point never repeats a position with three equal coordinates, and markers do not jump again and
-    again to a place that none moves to. A capture in which nothing moves stays unchanged.
+    again to a place that none moves to. A capture in which nothing moves stays unchanged, unless two points
+    of a frame are equal.
     """
     positions = capture.positions
     equal = (positions == positions[..., :1]).all(axis=-1)
@@ -141,7 +142,10 @@ def _without_stand_ins(capture: Capture) -> tuple[Capture, int, int]:
     stands = equal | (np.isin(keys, places) & (capture.num_frames >= _MIN_FRAMES))
     there = np.isfinite(positions[..., 0]) & ~stands
     tracks = (positions[there[:, column], column] for column in range(positions.shape[1]))
-    if not stands.any() or not any((track != track[:1]).any() for track in tracks):  # nothing moves
+    # two markers are never at one place; a file of nothing else is refused elsewhere
+    alike = bool(there.any()) and int(equal.sum(axis=1).max(initial=0)) > 1
+    moves = any((track != track[:1]).any() for track in tracks)
+    if not stands.any() or not (alike or moves):
         return capture, 0, 0
     zeros = int((equal & (positions[..., 0] == 0.0)).sum())
     missing = np.where(stands[..., None], np.nan, positions)

@@ -59,6 +59,7 @@ from handsim.hand.model import (
     HandMotion,
     between_poses,
     bridge_gaps,
+    check_bounds,
     hand_keypoints,
     is_steady,
     times_at,
@@ -263,13 +264,13 @@ class Take:
             settings: What made it, as JSON.
 
         Raises:
-            ArgumentError: The arrays do not fit together, or hold what they cannot.
+            ArgumentError: The arrays do not fit together, or hold what they cannot, such as degrees.
         """
         qpos, points = as_numbers("qpos", qpos), as_numbers("points", points)
         nowhere = np.full((len(points), len(bodies), 7), np.nan)
         poses = nowhere if body_poses is None else as_numbers("body_poses", body_poses)
         check_number("the rate [Hz]", rate, 0.0, above=True)
-        return cls(
+        take = cls(
             rate=rate,
             times=np.arange(len(qpos)) / rate,
             hands=hands,
@@ -286,6 +287,8 @@ class Take:
             body_rms=np.full(poses.shape[:2], np.nan),
             settings=dict(settings or {}),
         )
+        check_bounds(take.qpos)
+        return take
 
     @classmethod
     def of_poses(

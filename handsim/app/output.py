@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from upath import UPath
 
+from handsim._checks import check_type
 from handsim.app.workers import Job
 from handsim.errors import ArgumentError, DatasetError, HandSimError, HandSimWarning, shortened
 from handsim.files.inputs import checksum, load_json
@@ -82,9 +83,8 @@ def place_of(out: str | Place) -> Place:
     """The folder of a name: on this machine, or of an object store, as s3://bucket/prefix."""
     if isinstance(out, Path) or (isinstance(out, str) and "://" not in out):
         return Path(out)
+    check_type("the address", out, (str, UPath), "a folder, or one like s3://bucket/prefix")
     wrong = f"the address is '{shortened(str(out), 200)}', expected"
-    if not isinstance(out, str | UPath):
-        raise ArgumentError(f"{wrong} a folder, or one like s3://bucket/prefix")
     protocol, _, path = str(out).partition("://")
     if _PASSWORD_PATTERN.match(path):  # it would be in messages, and be sent to workers
         raise ArgumentError(

@@ -89,6 +89,8 @@ _MAX_FRAMES: Final = 1 << 22
 _MAX_DRIFT: Final = 0.01  # largest deviation of times from a steady rate, in frames
 _MAX_GAP: Final = 0.1  # longest gap that interpolation bridges [s]
 _MAX_GAP_FRAMES: Final = 2.5  # longest gap that interpolation bridges in old frames, if that is longer
+_FARTHEST_WRIST: Final = 50.0  # largest coordinate of a wrist [m]
+_LARGEST_ANGLE: Final = 2.0 * np.pi  # largest joint angle [rad]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -345,6 +347,20 @@ def join_qpos(
     qpos[:, 3:7] = (1.0, 0.0, 0.0, 0.0) if quaternion is None else quaternion
     qpos[:, 7:] = angles
     return qpos
+
+
+def check_bounds(qpos: Float[np.ndarray, "*T 27"]) -> None:
+    """Refuse poses in millimeters or degrees, which lie beyond any room or turn; NaN is no pose."""
+    farthest, widest = (np.nanmax(np.abs(some), initial=0.0) for some in (qpos[..., :3], qpos[..., 7:]))
+    if farthest > _FARTHEST_WRIST:
+        raise ArgumentError(
+            f"a wrist is {farthest:.4g} m from the origin along an axis, expected at most "
+            f"{_FARTHEST_WRIST:g}; are these millimeters?"
+        )
+    if widest > _LARGEST_ANGLE:
+        raise ArgumentError(
+            f"a joint angle is {widest:.4g} rad, expected at most {_LARGEST_ANGLE:.3f}; are these degrees?"
+        )
 
 
 def hand_keypoints(model: HandModel, qpos: Float[np.ndarray, "T 27"]) -> Float[np.ndarray, "T 21 3"]:

@@ -203,7 +203,7 @@ def changed(index, value):
         ({"qpos": BASE, "angles": BASE[:, 7:]}, "expected qpos, or angles and T_world_wrist"),
         ({"angles": BASE[:, 7:], "T_world_wrist": np.ones((2, 4, 4))}, "not a rigid transform in frame 0"),
         (changed((1, 3), 0.5), "quaternion .* of length 0.5 in frame 1"),
-        (changed((1, 8), 30.0), "30 rad, expected at most 3.142; are these degrees"),
+        (changed((1, 8), 30.0), "30 rad, expected at most 6.283; are these degrees"),
         (changed((0, 0), 600.0), "600 m from the origin .* are these millimeters"),
         (changed((0, 0), np.inf), "infinite"),
         ({"qpos": np.full((2, 27), np.nan)}, "there is no hand in any frame"),
@@ -256,3 +256,8 @@ def test_frames_without_a_hand_are_counted(tmp_path, qpos):
     lost[1] = np.nan
     with pytest.warns(HandSimWarning, match=r"frames without a hand are not drawn: 1 of 3 \(the first: 1\)"):
         assert render_take(lost, tmp_path / "pictures", "png", passes=("ids",), workers=1) == 2
+
+
+def test_poses_in_the_place_of_the_folder_are_told():
+    with pytest.raises(ArgumentError, match=r"the address is an array \(3, 27\), expected a folder"):
+        render_take("pictures", np.zeros((3, 27)))

@@ -75,6 +75,8 @@ def test_cameras_must_look_at_the_hands():
         check(seeing, blind)
     with pytest.raises(RigError, match="no camera has a hand in its picture in any of 3 frames"):
         check(blind)
+    with pytest.raises(RigError, match=r"camera 'far' stands 600 m from the origin.* are these millimeters"):
+        check(pinhole("far", (640, 480), 600.0).at(look_at(1e3 * eye, np.zeros(3))))
 
 
 @functools.cache

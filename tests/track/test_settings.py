@@ -6,6 +6,7 @@ import dataclasses
 import json
 import warnings
 
+import numpy as np
 import pytest
 
 from gloves import load_layout
@@ -65,9 +66,17 @@ def test_fields_that_are_named_differ_from_the_settings():
         ({"known": {"index_PIP": 60.0}}, "index_PIP_flexion"),
         ({"known": {"both:index_PIP_flexion": 60.0}}, "side of a known angle"),
         ({"known": {"index_PIP_flexion": 600.0}}, "from -180 to 180"),
+        ({"known": {"index_PIP_flexion": "60"}}, "known: index_PIP_flexion is '60', expected a number"),
+        ({"known": "index_PIP_flexion=60"}, "expected names with their values"),
         ({"known": {"index_PIP_flexion": 60.0}, "smooth": False}, "smooth=False"),
     ],
 )
 def test_known_angles_are_of_joints_and_need_poses_over_time(options, message):
     with pytest.raises(ArgumentError, match=message):
         TrackSettings(**options)
+
+
+def test_known_angles_may_be_numbers_of_numpy():
+    angles = {"index_PIP_flexion": np.float32(30.0), "left:ring_PIP_flexion": np.int64(45)}
+    record = TrackSettings(known=angles).record()
+    assert record["known"] == {"index_PIP_flexion": 30.0, "left:ring_PIP_flexion": 45}

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from gloves.fit import GloveFit
-from handsim._checks import as_numbers, check_array
+from handsim._checks import as_numbers, check_array, check_type
 from handsim.arrays import Doubles, Integers
 from handsim.errors import ArgumentError
 from handsim.hand.model import join_qpos
@@ -189,6 +189,7 @@ def solve_pose(
     Raises:
         ArgumentError: The arrays do not fit the glove or each other, or a frame has fewer than 4 markers.
     """
+    check_type("fit", fit, GloveFit, "a GloveFit, as attach returns it")
     count = fit.layout.num_markers
     targets = as_numbers("targets", targets)
     if targets.ndim != 3 or targets.shape[1:] != (count, 3):

@@ -194,12 +194,21 @@ def test_recurring_zeros_are_missing_and_counted(hand, tmp_path, suffix):
     np.testing.assert_array_equal(missing, expected)
 
 
+def test_zeros_of_a_single_frame_are_missing(hand, tmp_path):
+    positions = hand.positions[:1].copy()
+    positions[0, [4, 7]] = 0.0
+    write_capture(tmp_path / "still.trc", Capture(NAMES_PLAUSIBILITY, positions, 120.0))
+    with pytest.warns(HandSimWarning, match=r"2 points at exactly \(0, 0, 0\) are read as missing"):
+        capture = read_capture(tmp_path / "still.trc")
+    assert np.flatnonzero(np.isnan(capture.positions[0, :, 0])).tolist() == [4, 7]
+
+
 def test_a_single_zero_and_what_stands_still_stay(hand):
     positions = hand.positions.copy()
     positions[3, 4] = 0.0
     assert not settled(Capture(NAMES_PLAUSIBILITY, positions, 120.0)).findings
     still = np.zeros((5, 3, 3))
-    still[:, 1] = 1.0
+    still[:, 1:] = [[1.0], [2.0]]
     assert not settled(Capture(NAMES_PLAUSIBILITY[:3], still, 120.0)).findings
 
 

@@ -162,6 +162,12 @@ def test_poses_alone_are_a_take(take, rng):
         Take.of_poses(take.hands[0], qpos, rate=30.0)
     with pytest.raises(ArgumentError, match="a hand is a HandModel, expected a GloveFit"):
         Take.of_poses([take.hands[0].model], qpos, rate=30.0)
+    with pytest.raises(ArgumentError, match="are these degrees"):
+        Take.of_poses(
+            take.hands[:1], np.concatenate([qpos[..., :7], np.rad2deg(qpos[..., 7:])], -1), rate=30.0
+        )
+    with pytest.raises(ArgumentError, match="are these millimeters"):
+        Take.of_poses(take.hands[:1], qpos + 300.0 * np.eye(27)[2], rate=30.0)
 
 
 def test_a_folder_is_no_take(tmp_path):

@@ -261,6 +261,8 @@ def test_bad_targets_are_told(rng):
     model, glove = gloved("right", rng)
     with pytest.raises(ArgumentError, match=r"targets have shape \(2, 13, 3\), expected \(T, 19, 3\)"):
         solve_pose(GloveFit(model, glove), np.zeros((2, 13, 3)))
+    with pytest.raises(ArgumentError, match="fit is 'dense19', expected a GloveFit"):
+        solve_pose("dense19", np.zeros((2, 19, 3)))
     few = np.full((2, 19, 3), np.nan)
     few[0], few[1, :3] = glove.points, 0.1
     with pytest.raises(ArgumentError, match="frame 1 has 3 markers, expected at least 4"):
