@@ -58,7 +58,7 @@ lambda_1."""
 HEIGHT_SPREAD: Final = 0.0005  # [m] initial standard deviation of a marker's height over the design's
 _HAND_CORRELATION: Final = 0.6
 """Correlation of a marker's slips on both hands of a person. On two people of Mocap_SIG18_Data whose hands
-were measured apart it is 0.83 to 0.94, as on one hand in two captures; in simulated captures it is 0. With 0.8
+were measured apart it is 0.83 to 0.94, as on one hand in two captures; in simulated captures 0. With 0.8
 angles of simulated hands are 0.15 degrees farther off, and as many labels of the real hands are right."""
 CONTACT_SPREAD: Final = 0.0007
 """Standard deviation of a pad's compression around `PAD_COMPRESSION` [m]; (noise / spread)^2 is lambda_2."""
