@@ -320,7 +320,7 @@ def test_a_body_is_learned_from_a_capture_of_it(capture, tmp_path, capsys):
 def test_a_body_is_followed_through_a_stream(capture, tmp_path, capsys):
     out = tmp_path / "live.npz"
     with ReplayServer(capture.with_suffix(".truth.npz")) as server:
-        asked = ["--live", server.url, "--seconds", "0.2", "--body", "controller", "--out", str(out)]
+        asked = ["--live", server.url, "--seconds", "0.5", "--body", "controller", "--out", str(out)]
         assert main(["track", *asked]) == 0
     assert (load_take(out).body_status != LOST).all()
     assert "controller: tracked" in capsys.readouterr().out
