@@ -32,16 +32,16 @@ def test_whole_numbers_stay_whole_and_always_change():
 
 
 def test_kernels_that_read_a_number_are_found_with_their_callers(sources):
-    gate = sources.kernels_of(FOUND["track/association/label_consistency.py:_GATE"])
-    assert {name for _, name in gate} == {"_gate", "_worst_label"}
+    gate = sources.kernels_of(FOUND["track/association/label_consistency.py:_GATE_SQUARE"])
+    assert {name for _, name in gate} == {"_gate_in_place", "_worst_label"}
     assert len(sources.kernels_of(FOUND["track/kinematics/marker_kinematics.py:LIMIT_PRECISION"])) > 1
     assert not sources.kernels_of(FOUND["track/tracker.py:_DOUBT_SHARE"])
 
 
 def test_a_number_is_plain_if_functions_of_its_module_alone_read_it(sources):
     assert sources.is_plain(FOUND["track/tracker.py:_DOUBT_SHARE"])
-    assert not sources.is_plain(FOUND["track/association/label_consistency.py:_GATE"])  # a kernel
-    assert not sources.is_plain(FOUND["track/takes/take_summary.py:_MOST_DOUBTS"])  # a default of an argument
+    assert not sources.is_plain(FOUND["track/association/label_consistency.py:_GATE_SQUARE"])  # a kernel
+    assert not sources.is_plain(FOUND["track/takes/take_summary.py:_MOST_SPANS"])  # a default of an argument
     assert not sources.is_plain(FOUND["track/hand_size.py:AT_HAND"])  # another module
     ran = {("track/tracker.py", sources._lines["_DOUBT_SHARE"][0][1])}
     assert sources.is_read(FOUND["track/tracker.py:_DOUBT_SHARE"], ran)

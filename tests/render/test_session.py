@@ -24,6 +24,7 @@ from handsim.hand.model import hand_keypoints
 from handsim.motion_files.motion import OPENXR_JOINTS, joint_poses
 from handsim.space.camera import pinhole, preset
 from handsim.space.objects import load_object
+from handsim.space.rig import CameraRig
 from handsim.space.transforms import quaternion_matrix, rigid, rotated_poses
 from poses import sample_poses
 from render import Backgrounds, DepthSensor, PictureStream, RenderConfig, ViewConfig, draw, render_take
@@ -451,44 +452,47 @@ def test_the_default_sensor_measures_hands_from_the_users_eyes(path):
         assert (frame.noisy.depth[shown] > 0.0).mean() > 0.7
 
 
-def reaching_the_eyes(path, folder, config):
-    """A copy of the take whose left hand is at the camera in frames 24 and 25."""
+def reaching_cameras(path, folder):
+    """A copy of the take whose left hand is at two cameras in frames 24 and 25, and the cameras."""
     take = load_take(path)
     middle = take.hands[1].model.skin(take.qpos[24:25, 1])[0].mean(axis=0)
-    eye = Drawing(subject_of_take(take), config).viewpoints.cameras(24)[0].T_world_camera[:3, 3]
-    take.qpos[24:26, 1, :3] += eye - middle
+    head = RenderConfig(view=ViewConfig("head", views=2))
+    eyes = Drawing(subject_of_take(take), head).viewpoints.cameras(24)
+    take.qpos[24:26, 1, :3] += eyes[0].T_world_camera[:3, 3] - middle
     take.save(folder / "reaching.truth.npz")
-    return folder / "reaching.truth.npz"
+    return folder / "reaching.truth.npz", eyes
 
 
 def test_frames_with_a_camera_in_a_hand_are_left_out_and_told(path, tmp_path, capsys):
-    config = dataclasses.replace(PLAIN, view=ViewConfig("head", views=2))
-    take, out = reaching_the_eyes(path, tmp_path, config), tmp_path / "out"
+    (take, eyes), out = reaching_cameras(path, tmp_path), tmp_path / "out"
     for _ in range(2):  # also by a rendering that has nothing left to do
-        assert render_take(take, out, ["coco", "webdataset"], config, workers=1) == 6
+        assert render_take(take, out, ["coco", "webdataset"], PLAIN, camera=eyes, workers=1) == 6
         assert left_out_frames(out) == [24]
     pictures = sorted(file.stem for file in (out / "coco" / "images").rglob("*.jpg"))
-    assert pictures == [f"view{view}_{frame:06d}" for view in range(2) for frame in (0, 12, 36)]
+    assert pictures == [f"{eye.name}_{frame:06d}" for eye in eyes for frame in (0, 12, 36)]
     assert (out / SHEET).is_file()
+    CameraRig("eyes", tuple(eyes)).save(tmp_path / "eyes.toml")
     words = f"render {take} --out {tmp_path / 'command'} --format png --every 12 --passes depth"
-    assert main([*words.split(), "--placement", "head", "--views", "2", "--workers", "1"]) == 0
+    assert main([*words.split(), "--cameras", str(tmp_path / "eyes.toml"), "--workers", "1"]) == 0
     said = capsys.readouterr().out
     assert f"{tmp_path / 'command'}: 6 images in" in said
     assert "frames left out: 1 (the first: 24), where a camera would be inside a hand or an object" in said
-    only = dataclasses.replace(config, every=24, frames_per_shard=1)
+    only = dataclasses.replace(PLAIN, every=24, frames_per_shard=1)
     monkey = tmp_path / "only"
-    assert render_take(take, monkey, ["png"], only, workers=1) == 2, "an empty shard is finished too"
+    count = render_take(take, monkey, ["png"], only, camera=eyes, workers=1)
+    assert count == 2, "an empty shard is finished, too"
     with pytest.raises(HandSimError, match=r"in frame 24"):
-        list(draw(take, config=config, frames=[24]))
+        list(draw(take, config=PLAIN, camera=eyes, frames=[24]))
 
 
 def test_a_rendering_without_any_frame_is_told(path, tmp_path):
-    config = dataclasses.replace(PLAIN, view=ViewConfig("head"), every=1)
-    take = load_take(reaching_the_eyes(path, tmp_path, config))
-    eye = Drawing(subject_of_take(take), config).viewpoints.cameras(24)[0]
+    config, (file, eyes) = dataclasses.replace(PLAIN, every=1), reaching_cameras(path, tmp_path)
+    take = load_take(file)
     models = tuple(hand.model for hand in take.hands)
     with pytest.raises(HandSimError, match="no pictures: in all 2 frames a camera would be inside a hand"):
-        render_take(take.qpos[24:26], tmp_path / "out", ["png"], config, model=models, camera=eye, workers=1)
+        render_take(
+            take.qpos[24:26], tmp_path / "out", ["png"], config, model=models, camera=eyes[0], workers=1
+        )
 
 
 def test_files_have_the_pictures_that_are_drawn_in_memory(path, tmp_path):

@@ -150,7 +150,7 @@ def test_an_evaluation_that_was_cut_off_is_done_by_the_next_run(dataset, tmp_pat
 def test_a_run_is_evaluated_in_proportion_to_its_samples(
     dataset, tmp_path, monkeypatch, samples, evaluations
 ):
-    monkeypatch.setattr("train.loop._HELD_OUT", 0.2)
+    monkeypatch.setattr("train.loop._HELD_OUT_SHARE", 0.2)
     steps = []
     with monkeypatch.context() as patch:
         patch.setattr("train.loop.paper_report", counting(seen := []))

@@ -174,7 +174,7 @@ def _is_likelier(take: Take, other: Take, events: _Events) -> Bool[np.ndarray, "
     for one, rival in ((take, other), (other, take)):
         right = np.clip(one.point_list.confidence[events.points], _LEAST_CONFIDENCE, 1.0 - _LEAST_CONFIDENCE)
         hand = rival.point_list.labels[events.points] // markers
-        is_silent = (hand >= 0) & (hand < len(take.hands)) & (one.point_list.labels[events.points] < 0)
+        is_silent = (hand >= 0) & (hand < len(take.hand_labels)) & (one.point_list.labels[events.points] < 0)
         is_silent[is_silent] &= one.status[rows[is_silent], hand[is_silent]] == LOST
         log_odds.append(np.where(is_silent, 0.0, np.log(right / (1.0 - right))))
     gain = np.bincount(events.numbers, log_odds[0] - log_odds[1])

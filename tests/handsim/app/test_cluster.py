@@ -124,7 +124,7 @@ def test_a_job_that_ends_every_worker_is_told(cluster, client):
     client.run_on_scheduler(lambda dask_scheduler: setattr(dask_scheduler, "allowed_failures", 0))
     try:
         with (
-            pytest.raises(HandSimError, match="a job was begun 1 times, and its worker died each time"),
+            pytest.raises(HandSimError, match="a job was begun 1 times; its worker died each time"),
             chosen_workers(cluster.scheduler_address, None, print) as workers,
         ):
             list(run_jobs(die, [7], workers))

@@ -11,7 +11,7 @@ from handsim.cli.main import main
 from train import CNNConfig, Corruption, GenerateSettings, SceneMix, TrainSettings, evaluate_labeler
 from train.data.batches import paper_corruption
 from train.evaluation import SEEN
-from train.loop import _rate
+from train.loop import _scheduled_rate
 from train.settings import EPOCHS, usual_settings
 from train.simulation.generation import make_dataset
 
@@ -77,7 +77,7 @@ def test_the_preset_is_section_3_3_of_the_paper(config_of):
     assert config.optimizer == "sgd" and config.learning_rate == 0.6 and config.weight_decay == 0.0
     assert config.batch == 256
     assert config.samples == 75 * FRAMES
-    rates = [_rate(config, epoch / 75) for epoch in (0, 49, 51, 69, 71, 74)]
+    rates = [_scheduled_rate(config, epoch / 75) for epoch in (0, 49, 51, 69, 71, 74)]
     assert rates == pytest.approx([1, 1, 0.1, 0.1, 0.01, 0.01])
     assert config.occlude is None and paper_corruption(19).occlude == 5 and paper_corruption(13).occlude == 3
     assert config.ghosts == 2 and Corruption().margin == 0.1
