@@ -172,7 +172,7 @@ def test_a_folder_may_be_an_address(tmp_path, memory):
     for name in (tmp_path, str(tmp_path), tmp_path.as_uri(), UPath(tmp_path)):
         assert place_of(name) == tmp_path and isinstance(place_of(name), Path)
     assert place_of(memory) == memory and place_of(str(memory)) == memory
-    with pytest.raises(ArgumentError, match="the address is '3', expected a folder, or one like s3://"):
+    with pytest.raises(ArgumentError, match="the address is 3, expected a folder, or one like s3://"):
         place_of(3)
 
 
