@@ -366,5 +366,5 @@ def _undistortion_map(camera: Camera) -> Floats:
 
 
 def without_lens(camera: Camera) -> Camera:
-    """The pinhole camera with the same matrix and pose."""
+    """A camera without distortion that has the same matrix and pose."""
     return dataclasses.replace(camera, lens=Lens())

@@ -31,7 +31,7 @@ def unexpected(name: str, value: object, expected: str, valid: Iterable[str] = (
 def check_choice(
     given: object, valid: Collection[str], *, noun: str, error: type[HandSimError] = ArgumentError
 ) -> None:
-    """Refuse a name that is not valid, with the sentence of `choices`."""
+    """Raise an error that lists the valid names if the given name is none of them."""
     if given not in valid:
         raise error(choices(str(given), valid, noun=noun))
 

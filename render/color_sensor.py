@@ -100,7 +100,7 @@ def linear_of(rgb: UInt8[np.ndarray, "H W 3"]) -> Float32[np.ndarray, "H W 3"]:
 
 
 def light_of(levels: NDArray[Any]) -> NDArray[Any]:
-    """Light of sRGB levels (...,) by IEC 61966-2-1, 1 for 255, and by the painters' `GAMMA` beyond."""
+    """Linear light of sRGB levels (...,): IEC 61966-2-1 up to level 255, where it is 1; `GAMMA` above."""
     value = levels / 255.0
     light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
     return np.where(value > 1.0, value**GAMMA, light)

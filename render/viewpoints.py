@@ -11,6 +11,7 @@ import itertools
 import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import numpy as np
@@ -73,7 +74,7 @@ class Framing:
     """Distances and directions at which cameras show the hands of a take."""
 
     def __init__(self, take: Take, user: UserBody | None = None) -> None:
-        self.user = user
+        self.user, self._take = user, take
         straight = -quaternion_matrix(take.qpos[..., 3:7])[..., 0]
         self.forearms: Doubles = straight if user is None else user.forearms
         """Unit direction (T, H, 3) from each wrist to its elbow; NaN where there is no hand."""
@@ -91,7 +92,6 @@ class Framing:
         self.sampled: Integers = np.unique(np.linspace(0, take.num_frames - 1, _SAMPLES).astype(int))
         """Some frames, in which views are compared."""
         if user is not None:
-            self._seen = SeenHands(take, self.sampled)
             self._arms = user.axes(take.qpos[self.sampled, :, :3], user.forearms[self.sampled])
         known = np.flatnonzero(self._there.any(axis=1))
         flat = self.points[known].reshape(len(known), -1, 3).astype(np.float64)
@@ -144,6 +144,11 @@ class Framing:
             total = total * (1.0 - np.nan_to_num(covered))
         return np.where(there.any(axis=1), total, np.nan)
 
+    @cached_property
+    def seen(self) -> SeenHands:
+        """The hands in the sampled frames."""
+        return SeenHands(self._take, self.sampled)
+
     def clear_share(self, positions: Float[np.ndarray, "F 3"]) -> float:
         """Share of the sampled frames that hide less than `MOST_HIDDEN` of each hand's keypoints.
 
@@ -151,7 +156,7 @@ class Framing:
         """
         if self.user is None:
             return 1.0
-        hidden = self._seen.most_hidden(self._arms, positions[:, None])
+        hidden = self.seen.most_hidden(self._arms, positions[:, None])
         return float((hidden < MOST_HIDDEN).mean())
 
     def shortest(
@@ -508,7 +513,7 @@ def _head(config: ViewConfig, take: Take, framing: Framing, rng: np.random.Gener
         inside = (needed <= 1.0) + np.clip(2.0 - needed, 0.0, 1.0)  # hands that leave pictures do so little
         tried.append((place, rigid(turned, place)[frames], float(inside.mean())))
     trials = ([[camera.at(pose)] for pose in poses] for _, poses, _ in tried)
-    hidden = user.hidden(take, SeenHands(take, frames), frames, trials)
+    hidden = user.hidden(take, framing.seen, frames, trials)
     clear = np.array([(share < MOST_HIDDEN).mean() for share in hidden])
     worth = clear + [inside for *_, inside in tried]
     eyes = tried[int(np.argmax(worth - _EFFORT * np.linalg.norm(_LEANS, axis=1)))][0]

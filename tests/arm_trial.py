@@ -1,4 +1,4 @@
-"""The labeled trial of a hand and its arm that docs/angles.md measures a wrist from."""
+"""A simulated trial with labeled markers on hand, forearm and elbow, for the commands of docs/angles.md."""
 
 from __future__ import annotations
 

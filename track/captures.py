@@ -390,10 +390,13 @@ def _with_forearms(setup: TrackerSetup, frames: Sequence[StreamedFrame]) -> Trac
     if not layout.forearm or given.issuperset(setup.user.sides):
         return setup
     bodies = [*setup.bodies]
-    for side, body in find_forearms([one.points for one in frames], setup.user.hands, setup.labeler).items():
-        if body is not None and side not in given:
+    found = find_forearms([one.points for one in frames], setup.user.hands, setup.labeler)
+    for side, body in found.items():
+        if side in given:
+            continue
+        if body is not None:
             bodies.append(body)
-        elif body is None:
+        else:
             names = ", ".join(one.name for one in layout.forearm)
             told = (
                 f"the {side} forearm is not found, expected {names} to keep their distances beside the hand"

@@ -231,7 +231,7 @@ def remove_leftovers(folder: Path, names: str = "**/.*.tmp-*") -> None:
 
 
 def remove_abandoned(final: Path) -> None:
-    """Remove the temporary files of `final` whose process has ended."""
+    """Remove the temporary files that processes left beside the output `final` when they were killed."""
     prefix = _temporary_prefix(final)
     for leftover in final.parent.glob(f"{glob.escape(prefix)}*{glob.escape(final.suffix)}"):
         number = leftover.name.removeprefix(prefix).removesuffix(final.suffix).removesuffix(_OLDER_MARK)

@@ -195,7 +195,7 @@ def _parse_rig(table: Mapping[str, Any], stem: str) -> RigFile:
 
 
 def _read_camera(top: Mapping[str, Any], own: Mapping[str, Any], number: int) -> Camera:
-    """Read a camera; its own keys replace those at the top of the file."""
+    """Read a camera of a rig's file; keys that it lacks are taken from the top of the file."""
     owner = f"camera {number}"
     check_keys(own, owner, _CAMERA_KEYS, optional=_CAMERA_KEYS)
     pose = _pose(own, owner)

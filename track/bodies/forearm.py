@@ -190,18 +190,16 @@ def wrist_variances(take: Take, side: Side, hand: Float[np.ndarray, "T 3 5"]) ->
     forearm, elbow = take.forearm_index(side), take.elbow_index(side)
     assert forearm is not None
     noise, body = _rotation_noise(take, forearm), take.bodies[forearm]
-    glued = (
-        _GLUED**2 * np.linalg.inv(_inertia(body.positions - body.positions.mean(axis=0))) * body.is_nominal
-    )
+    inertia = _inertia(body.positions - body.positions.mean(axis=0))
+    glued = body.is_nominal * _GLUED**2 * np.linalg.inv(inertia)
     is_less = np.isin(SOURCES, ("gluing", "person"))
     found = np.full_like(hand, np.nan)
     found[:, :2] = hand[:, 1:] * np.where(is_less, _CONSTANT_FACTOR**2, 1.0)
     found[:, :2, 0] += (hands.swapaxes(1, 2) @ noise @ hands).diagonal(axis1=1, axis2=2)[:, 1:]
     found[:, :2, 1] += (hands.swapaxes(1, 2) @ glued @ hands).diagonal(axis1=1, axis2=2)[:, 1:]
     found[np.isnan(found[:, 0, 0])] = np.nan
-    if elbow is not None and take.bodies[forearm].has_axes:
-        # Pronation is a rotation about the forearm, measured perpendicular to the line of the epicondyles
-        # (y).
+    if elbow is not None and body.has_axes:
+        # Pronation is a rotation about the forearm, perpendicular to the y axis through the epicondyles.
         length = forearms[:, :, 0]
         axis = length * [1.0, 0.0, 1.0] / (1.0 - length[:, 1:2] ** 2)
         both = forearms @ noise @ forearms.swapaxes(1, 2) + _rotation_noise(take, elbow)

@@ -96,7 +96,7 @@ class ImprovedGlove:
     before: Worth
     after: Worth
     fewer: Sequence[tuple[int, Worth]]
-    """Number of remaining markers, and worth, as the least useful markers are dropped."""
+    """Number of markers and worth of the glove, each time that the least useful marker was dropped."""
     trials: Mapping[str, Mapping[str, Trial]]
     """Results on captures by kind of work, under `before` and `after`; empty if none was tried."""
 

@@ -20,7 +20,7 @@ from track.takes.smoothed_take import smooth_take, spread_model
 
 _ANGLE_SPREAD: Final = 0.3  # [rad] prior standard deviation of joint angles around the tracked ones
 BAD_RMS: Final = 0.006
-"""A fit with a larger RMS distance is tried again from general poses [m]."""
+"""RMS distance of markers [m] above which a fit is repeated from general poses."""
 
 
 class CorrectedTake(NamedTuple):

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _FIRST_DIRECTION: Final = np.array([0.62, -0.62, 0.48])  # from the target of the first look to the eye
 _LEAST_DISTANCE: Final = 0.22  # [m] least distance between the eye and its target
 _HALF_CUBE: Final = 0.3  # [m] half side of the cube in which wrists move in training sets
-_GRID_SPACING: Final = 0.2  # [m] spacing of grid points at which cameras are counted
+_GRID_SPACING: Final = 0.2  # [m] spacing of the points at which the page counts the cameras that see them
 _MOST_POINTS: Final = 40_000  # largest number of grid points
 _FRUSTUM_SIZE: Final = 0.12  # [m] size of a camera's frustum
 _FEW_CAMERAS_COLOR, _ALL_CAMERAS_COLOR = np.array([214, 96, 60]), np.array([40, 120, 180])
